@@ -114,13 +114,20 @@ class BodyState:
 Message = Hello | Setpoint | Control | BodyState
 _KINDS: dict[str, type[Message]] = {"hello": Hello, "set": Setpoint, "control": Control, "state": BodyState}
 _NAMES = {cls: name for name, cls in _KINDS.items()}
-_FIELDS = {cls: frozenset(f.name for f in fields(cls)) for cls in _NAMES}
+_ORDER = {cls: tuple(f.name for f in fields(cls)) for cls in _NAMES}
+_FIELDS = {cls: frozenset(names) for cls, names in _ORDER.items()}
+_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 M = TypeVar("M")
 
 
 def encode(message: Message) -> bytes:
     """One line, newline included."""
-    return json.dumps({"t": _NAMES[type(message)], **asdict(message)}, separators=(",", ":")).encode() + b"\n"
+    cls = type(message)
+    document: dict[str, Any] = {"t": _NAMES[cls]}
+    for name in _ORDER[cls]:
+        value = getattr(message, name)
+        document[name] = asdict(value) if isinstance(value, Marker) else value
+    return _ENCODER.encode(document).encode() + b"\n"
 
 
 def decode(line: bytes) -> Message:
@@ -156,7 +163,7 @@ _NUMBERS = {
 
 
 def _checked(message: M) -> M:
-    for name in _NUMBERS.get(type(message), ()):  # type: ignore[call-overload]
+    for name in _NUMBERS.get(type(message), ()):
         value = getattr(message, name)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise Unprocessable(f"{name} must be a finite number")

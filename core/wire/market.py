@@ -1,0 +1,189 @@
+"""The market's documents (DESIGN, section 6): announcement, bid, award, report, permit, task, reservation."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from core.wire.documents import Document, Identifier, Millilitres, Ratio, Seconds, Sentence
+from core.wire.geometry import Point3, Pose2
+
+TaskKind = Literal["water", "inventory", "harvest", "probe", "scan", "survey", "spray", "charge", "refill"]
+TaskState = Literal["announced", "awarded", "running", "done", "failed", "cancelled"]
+FINAL_STATES = ("done", "failed", "cancelled")
+Epoch = Annotated[int, Field(ge=0)]
+
+BID_WINDOW_S = 2.0
+REALLOCATE_S = 10.0
+REALLOCATE_MARGIN_RATIO = 0.2
+LEASE_S = 8.0
+"""A robot reports at least every LEASE_S / 4; silence this long loses the task."""
+
+
+class PlantCard(Document):
+    """What a robot needs to serve a plant."""
+
+    plant_id: Identifier
+    url: str
+    stem: Point3
+    """Centre of the soil's surface, world frame."""
+    dock: Pose2
+    """Base pose of a docked robot, world frame."""
+    nozzle: Point3
+    """Where water should leave, in the plant frame (x towards the dock)."""
+
+
+class Announcement(Document):
+    """`POST /bids` at a robot: a task looking for a robot."""
+
+    task_id: Identifier
+    kind: TaskKind
+    plant: PlantCard
+    dose_ml: Annotated[float, Field(ge=0, le=500)] = 0.0
+    priority: Annotated[int, Field(ge=0, le=9)] = 5
+    holder: str = ""
+    """The robot that has the task now, when the plant asks again."""
+
+
+class Breakdown(Document):
+    """Why a bid costs what it costs, in seconds."""
+
+    current_s: Seconds = 0.0
+    queue_s: Seconds = 0.0
+    travel_s: Seconds = 0.0
+    work_s: Seconds = 0.0
+    charge_s: Seconds = 0.0
+    refill_s: Seconds = 0.0
+
+
+class Bid(Document):
+    """A robot's answer: seconds until the task would be done, or None with the reason."""
+
+    task_id: Identifier
+    robot_id: Identifier
+    cost_s: Seconds | None
+    reason: Sentence = ""
+    breakdown: Breakdown = Breakdown()
+
+
+class Award(Document):
+    """`POST /tasks` at a robot. Idempotent by (task_id, epoch)."""
+
+    announcement: Announcement
+    epoch: Epoch
+    lease_s: Seconds
+    cost_s: Seconds
+
+
+class Report(Document):
+    """`POST /tasks/{id}/reports` at a plant: a robot's progress; renews the lease."""
+
+    robot_id: Identifier
+    epoch: Epoch
+    state: Literal["awarded", "running", "done", "failed"]
+    phase: Sentence = ""
+    """The job under way: undock, navigate, dock, act, or the one-line reason for waiting."""
+    progress: Ratio = 0.0
+    reason: Sentence = ""
+    delivered_ml: Millilitres | None = None
+
+
+class ReportAnswer(Document):
+    """`keep` false means: this task is no longer yours, drop it."""
+
+    keep: bool
+    reason: Sentence = ""
+    lease_s: Seconds = LEASE_S
+
+
+class PermitRequest(Document):
+    """`POST /tasks/{id}/permits`: may I do the irreversible act now?"""
+
+    robot_id: Identifier
+    epoch: Epoch
+    act: Literal["water", "pick"]
+    amount_ml: Annotated[float, Field(ge=0, le=500)] = 0.0
+
+
+class Permit(Document):
+    """One shot. Counted from the robot's request; nothing may begin after `valid_for_s`."""
+
+    permit_id: Identifier
+    task_id: Identifier
+    epoch: Epoch
+    act: Literal["water", "pick"]
+    dose_ml: Millilitres
+    valid_for_s: Seconds
+
+
+class TaskEvent(Document):
+    t_s: float
+    what: Sentence
+    robot_id: str = ""
+    epoch: Epoch = 0
+
+
+class BidRound(Document):
+    """One auction: who was asked, who answered what, who won and why."""
+
+    t_s: float
+    epoch: Epoch
+    bids: list[Bid]
+    winner: str = ""
+    why: Sentence = ""
+
+
+class Task(Document):
+    """A plant's task document; `GET /tasks/{id}`."""
+
+    task_id: Identifier
+    kind: TaskKind
+    state: TaskState
+    plant_id: Identifier
+    robot_id: str = ""
+    epoch: Epoch = 0
+    created_s: float
+    updated_s: float
+    asked_by: str = ""
+    """`soil`, or the subject of the token that asked."""
+    why: Sentence = ""
+    dose_ml: Millilitres = 0.0
+    delivered_ml: Millilitres | None = None
+    phase: Sentence = ""
+    progress: Ratio = 0.0
+    reason: Sentence = ""
+    permit_id: str = ""
+    permits: int = 0
+    rounds: list[BidRound] = []
+    events: list[TaskEvent] = []
+
+
+class TaskRequest(Document):
+    """`POST /tasks` at a plant, by an operator."""
+
+    kind: Literal["water"]
+    dose_ml: Annotated[float, Field(gt=0, le=500)] | None = None
+    priority: Annotated[int, Field(ge=0, le=9)] = 5
+
+
+class ReservationRequest(Document):
+    """`POST /dock/reservations` at a plant or station. Asking again renews. `dock_id` names a station's dock."""
+
+    robot_id: Identifier
+    dock_id: str = ""
+    for_s: Annotated[float, Field(gt=0, le=600)] = 30.0
+    yielding: bool = False
+    """The holder only rests here: it leaves when somebody else asks."""
+
+
+class Reservation(Document):
+    """Granted: the dock is yours until `valid_for_s` passes. Refused with 409 and a Problem naming the holder."""
+
+    reservation_id: Identifier
+    dock_id: str
+    robot_id: Identifier
+    epoch: Epoch
+    valid_for_s: Seconds
+    wanted_by: str = ""
+    """Somebody waits: a yielding holder goes now."""

@@ -1,0 +1,131 @@
+"""A pot's and a station's own documents."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from core.wire.documents import Document, Identifier, Millilitres, Ratio, Seconds, Sentence
+from core.wire.geometry import Point3, Pose2
+from core.wire.market import PlantCard
+
+Colour = Literal["green", "turning", "red"]
+
+
+class SoilReading(Document):
+    """The newest judged reading. `ratio` is None unless `state` is good."""
+
+    state: Literal["good", "stale", "stuck", "out_of_range", "open", "short", "down", "unknown"]
+    ratio: Ratio | None = None
+    volts: float | None = None
+    age_s: Seconds | None = None
+    why: Sentence = ""
+
+
+class Settings(Document):
+    """`PATCH /settings` takes any part of it."""
+
+    threshold_ratio: Annotated[float, Field(ge=0, le=0.6)] = 0.20
+    target_ratio: Annotated[float, Field(ge=0, le=0.6)] = 0.24
+    dose_ml: Annotated[float, Field(gt=0, le=500)] = 150.0
+    day_cap_ml: Annotated[float, Field(gt=0, le=10000)] = 1500.0
+    probe_every_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
+    soak_s: Annotated[float, Field(ge=0, le=3600)] = 60.0
+    """After a dose the water needs this long to reach the probe."""
+
+
+class PlantState(Document):
+    """`GET /state` of a pot."""
+
+    plant_id: Identifier
+    now_s: float
+    soil: SoilReading
+    thirsty: bool
+    """Asking for water now, with hysteresis."""
+    settings: Settings
+    open_tasks: list[str] = []
+    watered_today_ml: Millilitres = 0.0
+    dock_holder: str = ""
+    waiting: Sentence = ""
+    """Why nothing happens although the pot is thirsty; empty when nothing is amiss."""
+    card: PlantCard
+
+
+class Fruit(Document):
+    """One fruit of the inventory: the paper's five, the position in the plant frame, first and last seen."""
+
+    fruit_id: Identifier
+    colour: Colour
+    confidence: Ratio
+    x_m: Annotated[float, Field(ge=-5, le=5)]
+    y_m: Annotated[float, Field(ge=-5, le=5)]
+    z_m: Annotated[float, Field(ge=-5, le=5)]
+    radius_m: Annotated[float, Field(gt=0, le=0.2)]
+    robot_pose: Pose2 | None = None
+    """Base pose relative to the plant when it was seen."""
+    image_x_px: float | None = None
+    image_y_px: float | None = None
+    first_seen_s: float = 0.0
+    last_seen_s: float = 0.0
+
+
+class NewFruit(Document):
+    """`POST /inventory/fruits`."""
+
+    colour: Colour
+    confidence: Ratio = 0.75
+    x_m: Annotated[float, Field(ge=-5, le=5)]
+    y_m: Annotated[float, Field(ge=-5, le=5)]
+    z_m: Annotated[float, Field(ge=-5, le=5)]
+    radius_m: Annotated[float, Field(gt=0, le=0.2)]
+    robot_pose: Pose2 | None = None
+    image_x_px: float | None = None
+    image_y_px: float | None = None
+
+
+class Inventory(Document):
+    """`GET /inventory`; its generation is the ETag."""
+
+    plant_id: Identifier
+    generation: int = 0
+    fruits: list[Fruit] = []
+
+
+class DockState(Document):
+    dock_id: str
+    pose: Pose2
+    tap: bool = False
+    holder: str = ""
+    yielding: bool = False
+    wanted_by: str = ""
+
+
+class StationState(Document):
+    """`GET /state` of a station."""
+
+    station_id: Identifier
+    now_s: float
+    docks: list[DockState]
+    tap_open: bool
+    dispensed_ml: Millilitres = 0.0
+
+
+class TapRequest(Document):
+    """`POST /tap` by the robot that holds the tap's dock: open for at most this long."""
+
+    robot_id: Identifier
+    open_s: Annotated[float, Field(gt=0, le=60)]
+
+
+class TapGrant(Document):
+    open_s: Seconds
+    flow_mlps: Annotated[float, Field(gt=0)]
+
+
+class StationCard(Document):
+    station_id: Identifier
+    url: str
+    place: Point3
+    docks: list[DockState]
+    extra: dict[str, Any] = {}
