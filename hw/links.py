@@ -143,6 +143,12 @@ class MemoryLink:
         if self.peer is not None and not self.muted:
             asyncio.get_running_loop().call_later(self._latency_s, self.peer._shut)
 
+    def cut(self) -> None:
+        """The owner died: nothing written from now on arrives, and the other side sees the end."""
+        self.muted = True
+        if self.peer is not None:
+            asyncio.get_running_loop().call_later(self._latency_s, self.peer._shut)
+
     def _deliver(self, data: bytes) -> None:
         if not self._closed:
             self._buffer += data
