@@ -151,6 +151,21 @@ def launch_pose(dock: Pose2) -> Pose2:
     )
 
 
+def device_ports(scenario: Scenario) -> dict[str, int]:
+    """TCP port of every simulated device by its name, `robot-1.create`; the same names serve `memory://` links.
+
+    Ten ports a robot from `ports.devices` on; the station's board 99 above it, pot boards from 100 above it.
+    """
+    first = scenario.ports.devices
+    ports = {
+        f"{robot.id}.{device}": first + 10 * row + column
+        for row, robot in enumerate(scenario.robots)
+        for column, device in enumerate(("create", "ssc32", "stargazer"))
+    }
+    ports[f"{scenario.station.id}.board"] = first + 99
+    return ports | {f"{plant.id}.soil": first + 100 + row for row, plant in enumerate(scenario.plants)}
+
+
 def _problems(scenario: Scenario) -> Iterator[str]:
     yield from _doubled(scenario)
     half_x, half_y = scenario.arena.length_m / 2, scenario.arena.width_m / 2
