@@ -1,0 +1,26 @@
+"""A bar holds only what was measured."""
+
+import math
+
+import pytest
+
+from lab.results import Bar, held
+
+
+@pytest.mark.parametrize(
+    ("value", "op", "bar", "ok"),
+    [(1.0, ">=", 1.0, True), (0.99, ">=", 1.0, False), (0.02, "<=", 0.02, True), (0.03, "<=", 0.02, False)],
+)
+def test_a_bar_is_the_comparison_it_names(value, op, bar, ok):
+    assert Bar(metric="m", value=value, op=op, bar=bar).ok is ok
+
+
+@pytest.mark.parametrize("op", [">=", "<="])
+def test_what_was_not_measured_is_never_ok(op):
+    bar = Bar(metric="m", value=math.nan, op=op, bar=0.0)
+    assert not bar.ok
+    assert bar.document()["value"] is None
+
+
+def test_a_missing_metric_fails_its_bar():
+    assert [bar.ok for bar in held({"a": 1}, ("a", ">=", 1.0), ("b", ">=", 0.0))] == [True, False]
