@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
 
+from core.soil import ProbeState as ProbeState
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStatus:
@@ -160,18 +162,6 @@ class Localizer(Protocol):
     def rest(self, resting: bool) -> None: ...
 
     async def run(self) -> None: ...
-
-
-class ProbeState(Enum):
-    """What a soil reading is worth. Only GOOD is a measurement."""
-
-    GOOD = "good"
-    STALE = "stale"
-    STUCK = "stuck"
-    OUT_OF_RANGE = "out_of_range"
-    OPEN = "open"
-    SHORT = "short"
-    DOWN = "down"
 
 
 class SoilProbe(Protocol):

@@ -1,0 +1,177 @@
+"""Lynxmotion SSC-32 driver: fills `hw.ports.ServoBoard`.
+
+The board acknowledges no move and stops nothing by itself, so this driver polls what it commands (pulses, `Q`, analog
+inputs) and starts every connection by setting all known outputs low and stopping every channel the board still drives.
+What was asked while the link was down is dropped, never replayed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+from core.clock import Clock
+from core.errors import DriverError
+from hw.drivers.session import Pulse, Session
+from hw.links import Opener
+from hw.ports import ServoReading
+from hw.protocols import ssc32 as wire
+
+POLL_S = 0.1
+POLL_RESTING_S = 1.0
+ASK_VERSION_S = 0.4
+SILENCE_S = 0.7
+SILENCE_RESTING_S = 2.5
+ANALOG_INPUTS = 4
+BUFFER_BYTES_MAX = 256
+
+
+class Ssc32Driver(Session):
+    """An SSC-32 at `url`. `outputs` are its discrete outputs (relays): low at connection, at `stop` and at the end."""
+
+    def __init__(self, url: str, opener: Opener, clock: Clock, *, outputs: Iterable[int] = (), name: str = "ssc32") -> None:
+        super().__init__(url, opener, clock, name=name, silence_s=SILENCE_RESTING_S)
+        self._outputs = set(outputs)
+        self._resting = False
+        self._reading: ServoReading | None = None
+        self._known: set[int] = set()
+        self._moved: set[int] = set()
+        self._buffer = bytearray()
+        self._asked: tuple[int, ...] | None = None
+        self._identified = False
+        self._settled = False
+        self._identity = Pulse()
+        self._wake = Pulse()
+        self.version = ""
+        """What VER answered last."""
+        self.garbled = 0
+        """Answers thrown away because they did not fit their question."""
+
+    @property
+    def reading(self) -> ServoReading | None:
+        return self._reading
+
+    def move(self, pulses_us: Mapping[int, float], duration_s: float) -> None:
+        """Group move, clamped to 500..2500 us. Channels the board does not know jump; the others share `duration_s`.
+
+        Raises ValueError for a pulse or a duration that is not finite, or a channel the board does not have.
+        """
+        if not all(math.isfinite(value) for value in (*pulses_us.values(), duration_s)):
+            raise ValueError(f"a pulse or the duration is not finite: {dict(pulses_us)} in {duration_s} s")
+        if not all(0 <= channel < wire.CHANNELS for channel in pulses_us):
+            raise ValueError(f"no such channel among {sorted(pulses_us)}; the board has 0 to {wire.CHANNELS - 1}")
+        pulses = {channel: min(wire.PULSE_US_MAX, max(wire.PULSE_US_MIN, p)) for channel, p in pulses_us.items()}
+        first = {channel: pulse for channel, pulse in pulses.items() if channel not in self._known}
+        later = {channel: pulse for channel, pulse in pulses.items() if channel in self._known}
+        lines = (wire.encode_move(first) if first else b"") + (wire.encode_move(later, duration_s) if later else b"")
+        if lines and self._identified and self._send(lines):
+            self._known |= first.keys()
+            self._moved |= pulses.keys()
+
+    def output(self, channel: int, high: bool) -> None:
+        """Discrete output; remembered as one to set low."""
+        self._outputs.add(channel)
+        if self._identified or not high:
+            self._send(wire.encode_outputs({channel: high}))
+
+    def stop(self) -> None:
+        """One write: outputs low first, then STOP for every channel ever moved."""
+        self._send(self._quiet())
+
+    def rest(self, resting: bool) -> None:
+        """Poll at 1 Hz, or at 10 Hz again."""
+        if resting != self._resting:
+            self._resting = resting
+            self._wake.fire()
+
+    def _quiet(self) -> bytes:
+        low = wire.encode_outputs(dict.fromkeys(sorted(self._outputs), False)) if self._outputs else b""
+        return low + wire.encode_stop(sorted(self._moved))
+
+    def _farewell(self) -> bytes:
+        return self._quiet()
+
+    def _gone(self) -> None:
+        self._buffer.clear()
+        self._known.clear()
+        self._asked = None
+        self._identified = self._settled = False
+        self.silence_s = SILENCE_RESTING_S
+
+    async def _converse(self) -> None:
+        self._send(b"\x1b\r" + self._quiet())
+        while not self._identified:
+            self._buffer.clear()
+            self._send(wire.VERSION)
+            await self._pause(ASK_VERSION_S, self._identity)
+        self._ask(tuple(range(wire.CHANNELS)))
+        while True:
+            await self._pause(POLL_RESTING_S if self._resting else POLL_S, self._wake)
+            self._ask(tuple(sorted(self._known)))
+
+    async def _pause(self, seconds: float, until: Pulse) -> None:
+        try:
+            async with self._clock.timeout(seconds):
+                await until.wait()
+        except TimeoutError:
+            return
+
+    def _ask(self, channels: tuple[int, ...]) -> None:
+        """One write for everything: pulses, analog inputs, and `Q`, whose answer marks the end."""
+        self._buffer.clear()
+        self._asked = channels
+        pulses = wire.encode_query_pulses(channels) if channels else b""
+        self._send(pulses + wire.encode_query_analog(range(ANALOG_INPUTS)) + wire.QUERY_MOVING)
+
+    def _received(self, data: bytes) -> None:
+        self._buffer += data
+        if not self._identified:
+            self._identify()
+        elif self._asked is not None and len(self._buffer) >= (size := len(self._asked) + ANALOG_INPUTS + 1):
+            self._take(bytes(self._buffer), size)
+            self._buffer.clear()
+        del self._buffer[:-BUFFER_BYTES_MAX]
+
+    def _identify(self) -> None:
+        text, end, _ = self._buffer.partition(b"\r")
+        if not end:
+            return
+        if b"SSC32" not in text:
+            self._buffer.clear()
+            raise DriverError(f"{self._url} answers VER with {bytes(text[-40:])!r}", hint="is this an SSC-32?")
+        self.version = text[text.index(b"SSC32") :].decode("ascii", "replace")
+        self._identified = True
+        self._buffer.clear()
+        self._identity.fire()
+
+    def _take(self, answer: bytes, size: int) -> None:
+        """A whole answer; one of a wrong length or without `Q`'s mark is thrown away and asked again."""
+        channels, self._asked = self._asked or (), None
+        if len(answer) != size or answer[-1:] not in (wire.DONE, wire.MOVING):
+            self.garbled += 1
+            return
+        counts = dict(zip(channels, answer, strict=False))
+        self._learn(counts)
+        analog = tuple(wire.volts_of(count) for count in answer[len(channels) : -1]) if self._settled else ()
+        self._settled = True
+        self._reading = ServoReading(
+            stamp_s=self._clock.now(),
+            pulses_us={channel: count * 10.0 for channel, count in counts.items() if count},
+            moving=answer[-1:] == wire.MOVING,
+            analog_v=analog,
+        )
+        self.silence_s = SILENCE_RESTING_S if self._resting else SILENCE_S
+        self._heard()
+
+    def _learn(self, counts: Mapping[int, int]) -> None:
+        """Channels the board drives are known; one that it drives no more tells of a lost supply."""
+        driven = {channel for channel, count in counts.items() if count}
+        lost = self._known & counts.keys() - driven
+        if lost:
+            self._log.warning("the board forgot channels: did it lose its supply?", channels=sorted(lost))
+            self._settled = False
+            self._known -= lost
+        if inherited := driven - self._known - self._moved:
+            self._send(wire.encode_stop(sorted(inherited)))
+        self._moved |= driven
+        self._known |= driven
