@@ -109,7 +109,7 @@ class ServoReading:
     pulses_us: dict[int, float] = field(default_factory=dict)
     moving: bool = False
     analog_v: tuple[float, ...] = ()
-    """VA, VB, VC, VD [V]."""
+    """VA, VB and so on [V], as many as the driver was told to read; empty until they have settled."""
 
 
 class ServoBoard(Protocol):

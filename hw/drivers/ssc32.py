@@ -18,20 +18,41 @@ from hw.ports import ServoReading
 from hw.protocols import ssc32 as wire
 
 POLL_S = 0.1
+"""While servos move or an output is high."""
+POLL_STILL_S = 0.5
 POLL_RESTING_S = 1.0
+SETTLE_S = 0.5
+"""A move is watched this much longer than it should take."""
 ASK_VERSION_S = 0.4
-SILENCE_S = 0.7
-SILENCE_RESTING_S = 2.5
-ANALOG_INPUTS = 4
+SILENCE_POLLS = 2.5
+SILENCE_S_MIN = 0.5
+SILENCE_S_MAX = SILENCE_POLLS * POLL_RESTING_S
 BUFFER_BYTES_MAX = 256
 
 
 class Ssc32Driver(Session):
-    """An SSC-32 at `url`. `outputs` are its discrete outputs (relays): low at connection, at `stop` and at the end."""
+    """An SSC-32 at `url`.
 
-    def __init__(self, url: str, opener: Opener, clock: Clock, *, outputs: Iterable[int] = (), name: str = "ssc32") -> None:
-        super().__init__(url, opener, clock, name=name, silence_s=SILENCE_RESTING_S)
+    `outputs` are its discrete outputs (relays): low at connection, at `stop` and at the end. The first `analog_inputs`
+    of VA, VB, VC, VD are read.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        opener: Opener,
+        clock: Clock,
+        *,
+        outputs: Iterable[int] = (),
+        analog_inputs: int = 2,
+        name: str = "ssc32",
+    ) -> None:
+        super().__init__(url, opener, clock, name=name, silence_s=SILENCE_S_MAX)
         self._outputs = set(outputs)
+        self._high: set[int] = set()
+        self._analog_inputs = analog_inputs
+        self._busy_until_s = -math.inf
+        self._period_s = POLL_RESTING_S
         self._resting = False
         self._reading: ServoReading | None = None
         self._known: set[int] = set()
@@ -67,19 +88,26 @@ class Ssc32Driver(Session):
         if lines and self._identified and self._send(lines):
             self._known |= first.keys()
             self._moved |= pulses.keys()
+            self._busy_until_s = max(self._busy_until_s, self._clock.now() + duration_s + SETTLE_S)
+            self._wake.fire()
 
     def output(self, channel: int, high: bool) -> None:
         """Discrete output; remembered as one to set low."""
         self._outputs.add(channel)
-        if self._identified or not high:
-            self._send(wire.encode_outputs({channel: high}))
+        if not high:
+            self._high.discard(channel)
+            self._send(wire.encode_outputs({channel: False}))
+        elif self._identified and self._send(wire.encode_outputs({channel: True})):
+            self._high.add(channel)
+            self._wake.fire()
 
     def stop(self) -> None:
         """One write: outputs low first, then STOP for every channel ever moved."""
+        self._high.clear()
         self._send(self._quiet())
 
     def rest(self, resting: bool) -> None:
-        """Poll at 1 Hz, or at 10 Hz again."""
+        """Poll at 1 Hz, or at 2 Hz; while something moves always at 10 Hz."""
         if resting != self._resting:
             self._resting = resting
             self._wake.fire()
@@ -94,9 +122,11 @@ class Ssc32Driver(Session):
     def _gone(self) -> None:
         self._buffer.clear()
         self._known.clear()
+        self._high.clear()
         self._asked = None
         self._identified = self._settled = False
-        self.silence_s = SILENCE_RESTING_S
+        self._busy_until_s = -math.inf
+        self.silence_s = SILENCE_S_MAX
 
     async def _converse(self) -> None:
         self._send(b"\x1b\r" + self._quiet())
@@ -106,8 +136,18 @@ class Ssc32Driver(Session):
             await self._pause(ASK_VERSION_S, self._identity)
         self._ask(tuple(range(wire.CHANNELS)))
         while True:
-            await self._pause(POLL_RESTING_S if self._resting else POLL_S, self._wake)
+            self._period_s = self._poll_s()
+            self.silence_s = max(self.silence_s, self._silence_s())
+            await (self._clock.sleep(POLL_S) if self._period_s == POLL_S else self._pause(self._period_s, self._wake))
             self._ask(tuple(sorted(self._known)))
+
+    def _poll_s(self) -> float:
+        if self._high or self._clock.now() < self._busy_until_s:
+            return POLL_S
+        return POLL_RESTING_S if self._resting else POLL_STILL_S
+
+    def _silence_s(self) -> float:
+        return max(SILENCE_S_MIN, SILENCE_POLLS * self._period_s)
 
     async def _pause(self, seconds: float, until: Pulse) -> None:
         try:
@@ -121,13 +161,13 @@ class Ssc32Driver(Session):
         self._buffer.clear()
         self._asked = channels
         pulses = wire.encode_query_pulses(channels) if channels else b""
-        self._send(pulses + wire.encode_query_analog(range(ANALOG_INPUTS)) + wire.QUERY_MOVING)
+        self._send(pulses + wire.encode_query_analog(range(self._analog_inputs)) + wire.QUERY_MOVING)
 
     def _received(self, data: bytes) -> None:
         self._buffer += data
         if not self._identified:
             self._identify()
-        elif self._asked is not None and len(self._buffer) >= (size := len(self._asked) + ANALOG_INPUTS + 1):
+        elif self._asked is not None and len(self._buffer) >= (size := len(self._asked) + self._analog_inputs + 1):
             self._take(bytes(self._buffer), size)
             self._buffer.clear()
         del self._buffer[:-BUFFER_BYTES_MAX]
@@ -160,7 +200,7 @@ class Ssc32Driver(Session):
             moving=answer[-1:] == wire.MOVING,
             analog_v=analog,
         )
-        self.silence_s = SILENCE_RESTING_S if self._resting else SILENCE_S
+        self.silence_s = self._silence_s()
         self._heard()
 
     def _learn(self, counts: Mapping[int, int]) -> None:

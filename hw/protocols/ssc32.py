@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 CHANNELS = 32
 ANALOG_INPUTS = 8
@@ -19,7 +20,8 @@ DONE, MOVING = b".", b"+"
 QUERY_MOVING = b"Q\r"
 VERSION = b"VER\r"
 LINE_CHARS_MAX = 1024
-ESC = 0x1B
+ESC = b"\x1b"
+_IGNORED = bytes(byte for byte in range(256) if not 0x20 < byte < 0x7F and byte not in b"\r\x1b")
 
 
 def encode_move(
@@ -176,19 +178,12 @@ class LineReader:
     """Bytes from a host -> whole lines, upper case and without blanks. ESC drops the line being typed."""
 
     def __init__(self) -> None:
-        self._line = bytearray()
+        self._line = b""
 
     def feed(self, data: bytes) -> list[str]:
-        lines = []
-        for byte in data:
-            if byte == 0x0D:
-                lines.append(self._line.decode("ascii").upper())
-                self._line.clear()
-            elif byte == ESC or len(self._line) > LINE_CHARS_MAX:
-                self._line.clear()
-            elif 0x20 < byte < 0x7F:
-                self._line.append(byte)
-        return lines
+        *ended, rest = (self._line + data.translate(None, _IGNORED)).split(b"\r")
+        self._line = rest.rpartition(ESC)[2][-LINE_CHARS_MAX:]
+        return [line.rpartition(ESC)[2].decode("ascii").upper() for line in ended]
 
 
 _GROUP_ITEM = re.compile(r"#(\d+)(?:PO([+-]?\d+)|P(\d+)|(H|L)|:(\d+))((?:[ST]\d+)*)")
@@ -196,8 +191,13 @@ _SPEED = re.compile(r"S(\d+)")
 _TIME = re.compile(r"T(\d+)")
 
 
-def parse_line(line: str) -> list[Command]:
+@lru_cache(maxsize=256)
+def parse_line(line: str) -> tuple[Command, ...]:
     """One line as `LineReader` gives it -> commands; what the board would not understand yields nothing."""
+    return tuple(_parse(line))
+
+
+def _parse(line: str) -> list[Command]:
     if line.startswith("#"):
         return _parse_group(line)
     if line == "Q":

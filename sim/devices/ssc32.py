@@ -83,13 +83,15 @@ class Ssc32Emulator:
 
     def _drive(self, now_s: float) -> None:
         """One servo frame: every moving channel's pulse as of now."""
+        next_s = now_s + FRAME_S
         for number in sorted(self._moving):
             channel = self._channels[number]
             self._send(number, channel, now_s)
-            if now_s >= channel.end_s - 1e-9:
+            if channel.end_s <= now_s + 1e-9:
                 self._moving.discard(number)
-        ends = [self._channels[number].end_s for number in self._moving]
-        self._frame_s = min(now_s + FRAME_S, *ends) if ends else math.inf
+            elif channel.end_s < next_s:
+                next_s = channel.end_s
+        self._frame_s = next_s if self._moving else math.inf
 
     def _send(self, number: int, channel: _Channel, now_s: float) -> None:
         pulse = channel.pulse_us(now_s) + self._offsets_us.get(number, 0)
