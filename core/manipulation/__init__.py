@@ -1,0 +1,1 @@
+"""The gardener's arm: kinematics, and clear ways past pot and dock."""
