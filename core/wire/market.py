@@ -148,6 +148,7 @@ class Task(Document):
     asked_by: str = ""
     """`soil`, or the subject of the token that asked."""
     why: Sentence = ""
+    priority: Annotated[int, Field(ge=0, le=9)] = 5
     dose_ml: Millilitres = 0.0
     delivered_ml: Millilitres | None = None
     phase: Sentence = ""

@@ -1,0 +1,129 @@
+"""What a plant's market is made of: its rules, its durable document, its effects on the world, and what it may forget."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from core.allocation import permits
+from core.allocation.auction import Round
+from core.allocation.permits import Dose, OpenPermit
+from core.wire.documents import Document
+from core.wire.market import (
+    BID_WINDOW_S,
+    LEASE_S,
+    REALLOCATE_MARGIN_RATIO,
+    REALLOCATE_S,
+    Announcement,
+    Award,
+    Task,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rules:
+    """The market's times and bounds."""
+
+    bid_window_s: float = BID_WINDOW_S
+    lease_s: float = LEASE_S
+    reallocate_s: float = REALLOCATE_S
+    margin_ratio: float = REALLOCATE_MARGIN_RATIO
+    permit_valid_s: float = permits.PERMIT_VALID_S
+    backoff_s_min: float = 1.0
+    backoff_s_max: float = 30.0
+    resend_s: float = 1.0
+    """An award that nobody acknowledged is sent again this often until the lease ends."""
+    run_s_max: float = 900.0
+    """A robot that keeps a task this long without a permit loses it."""
+    doses_max: int = 3
+    """Doses without a rise of the soil's water content before a task fails."""
+    failures_max: int = 8
+    rounds_kept: int = 6
+    events_kept: int = 40
+    finished_kept: int = 20
+    open_max: int = 16
+
+
+@dataclass(slots=True, kw_only=True)
+class Limits:
+    """What the operator may change at run time."""
+
+    soak_s: float = 60.0
+    day_cap_ml: float = 1500.0
+    target_ratio: float = 0.24
+
+
+class MarketDocument(Document):
+    """What survives a restart."""
+
+    boot: int = 0
+    tasks: list[Task] = []
+    failures: dict[str, int] = {}
+    open_permit: OpenPermit | None = None
+    doses: list[Dose] = []
+
+
+@dataclass(frozen=True, slots=True)
+class Solicit:
+    """Ask these robots for bids; answers go to `bid` with the round's number."""
+
+    announcement: Announcement
+    round_number: int
+    robots: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """Send an award; then `award_answered`."""
+
+    robot_id: str
+    award: Award
+
+
+@dataclass(frozen=True, slots=True)
+class Kill:
+    """Tell a robot that a task is no longer its own; best effort."""
+
+    robot_id: str
+    task_id: str
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something for the history."""
+
+    kind: str
+    what: str
+    task_id: str = ""
+    robot_id: str = ""
+    data: dict[str, Any] = field(default_factory=dict)
+
+
+Effect = Solicit | Grant | Kill | Note
+
+
+@dataclass(slots=True, kw_only=True)
+class Live:
+    """What a task forgets in a restart."""
+
+    next_ask_s: float = math.inf
+    backoff_s: float = 0.0
+    lease_until_s: float = math.inf
+    reallocate_s: float = math.inf
+    resend_s: float = math.inf
+    cost_s: float = 0.0
+    running_since_s: float = math.inf
+    round: Round | None = None
+    silent: bool = False
+    """The lease ended while a permit was open."""
+    told: str = ""
+    """Why nobody took it, as last said."""
+
+
+@dataclass(frozen=True, slots=True)
+class Soil:
+    ratio: float | None
+    why: str
+    stamp_s: float
