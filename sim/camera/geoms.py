@@ -15,7 +15,7 @@ VISIBLE_GROUPS = (0, 1, 2)
 """Geoms of other groups are collision hulls and helpers."""
 
 PLAIN, ASTROTURF, SOIL, LEAF = 0, 1, 2, 3
-_TEXTURES = {"turf": ASTROTURF, "grass": ASTROTURF, "floor": ASTROTURF, "soil": SOIL, "leaf": LEAF}
+_TEXTURES = {"turf": ASTROTURF, "/soil": SOIL, "/leaf/": LEAF}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
