@@ -1,0 +1,189 @@
+"""What every service has: card, health, metrics, docs, events, one way to say no, one way to check who asks."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from importlib import metadata
+from typing import Any
+
+from fastapi import Depends, FastAPI, Header, Query, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import HTMLResponse, StreamingResponse
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from core.clock import Clock
+from core.errors import Forbidden, GardenError, Unavailable
+from core.mesh.auth import ANYBODY, ROLES, Caller, Verifier
+from core.mesh.describe import describe, docs_page
+from core.mesh.events import EventLog
+from core.mesh.guard import Guard, bearer
+from core.mesh.problems import problem_response
+from core.mesh.strict import body, parse
+from core.wire.documents import Document, HistoryEntry, NodeCard
+
+SSE_SILENCE_S = 15.0
+
+__all__ = ["Allow", "allow", "body", "create_app", "parse", "version"]
+
+
+class Health(Document):
+    status: str = "ok"
+
+
+class Readiness(Document):
+    ready: bool = True
+
+
+def version() -> str:
+    """The installed version of the garden."""
+    return metadata.version("robot-garden")
+
+
+class Allow:
+    """Dependency of a route that changes something: a token of one of `roles`. The endpoint receives the Caller."""
+
+    def __init__(self, roles: tuple[str, ...]) -> None:
+        self.roles = roles
+
+    async def __call__(self, request: Request) -> Caller:
+        state = request.app.state
+        verifier: Verifier | None = state.verifier
+        if verifier is None:
+            return ANYBODY
+        caller = verifier.verify(bearer(request.scope["headers"]), state.clock.now())
+        if caller.role not in self.roles:
+            roles = ", ".join(self.roles)
+            raise Forbidden(f"{caller.subject} is a {caller.role}", hint=f"this takes the token of a: {roles}")
+        return caller
+
+
+def allow(*roles: str) -> Any:
+    """`caller: Caller = allow("operator")` in an endpoint; raises Unauthorised (401) or Forbidden (403)."""
+    if unknown := set(roles) - set(ROLES):
+        raise ValueError(f"no such role: {unknown}")
+    return Depends(Allow(roles))
+
+
+def create_app(
+    *,
+    card: Callable[[], NodeCard],
+    clock: Clock,
+    verifier: Verifier | None,
+    ready: Callable[[], list[str]],
+    events: EventLog | None = None,
+    registry: CollectorRegistry | None = None,
+    body_bytes_max: int = 65536,
+    open_reads: bool = True,
+) -> FastAPI:
+    """A node's HTTP side, to which the service adds its own routes.
+
+    `ready` lists what is still missing (empty: ready). `verifier` None switches authentication off, for tests.
+    With `open_reads` false every request but health needs a token. Every POST with an `Idempotency-Key` is answered once
+    and the same again. `app.state` holds clock, verifier, events and registry.
+    """
+    app = FastAPI(title="Robot Garden", version=version(), docs_url=None, redoc_url=None)
+    registry = registry if registry is not None else CollectorRegistry()
+    app.state.clock, app.state.verifier, app.state.events, app.state.registry = clock, verifier, events, registry
+    app.add_middleware(
+        Guard,
+        clock=clock,
+        verifier=verifier,
+        registry=registry,
+        body_bytes_max=body_bytes_max,
+        open_reads=open_reads,
+    )
+    _refusals(app)
+    _plain_routes(app, card, ready, registry)
+    if events is not None:
+        _event_route(app, events)
+    app.openapi = lambda: describe(app)  # type: ignore[method-assign]
+    return app
+
+
+def _refusals(app: FastAPI) -> None:
+    async def on_garden_error(request: Request, error: Exception) -> Response:
+        assert isinstance(error, GardenError)
+        return problem_response(request.scope, error.status, error.title, str(error), error.hint)
+
+    async def on_http_error(request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        hint = {404: "GET /openapi.json lists what there is", 405: "another method may do"}.get(error.status_code, "")
+        headers = dict(error.headers or {})
+        return problem_response(request.scope, error.status_code, "", str(error.detail), hint, headers)
+
+    async def on_parameters(request: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)
+        told = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:8])
+        return problem_response(request.scope, 422, "", told[:1000], "see /docs")
+
+    app.add_exception_handler(GardenError, on_garden_error)
+    app.add_exception_handler(HTTPException, on_http_error)
+    app.add_exception_handler(RequestValidationError, on_parameters)
+
+
+def _plain_routes(
+    app: FastAPI, card: Callable[[], NodeCard], ready: Callable[[], list[str]], registry: CollectorRegistry
+) -> None:
+    @app.get("/", summary="Node card", tags=["node"])
+    async def node_card() -> NodeCard:
+        return card()
+
+    @app.get("/healthz", summary="The process answers", tags=["node"])
+    async def healthz() -> Health:
+        return Health()
+
+    @app.get("/readyz", summary="Able to do its work, or why not", tags=["node"])
+    async def readyz() -> Readiness:
+        if missing := ready():
+            raise Unavailable("; ".join(missing), hint="it is usually a matter of seconds; `garden doctor` looks closer")
+        return Readiness()
+
+    @app.get("/metrics", summary="Prometheus metrics", tags=["node"], response_class=Response)
+    async def metrics() -> Response:
+        return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
+
+    @app.get("/docs", include_in_schema=False)
+    async def docs() -> HTMLResponse:
+        return HTMLResponse(docs_page(card().id, app.openapi()))
+
+
+def _event_route(app: FastAPI, events: EventLog) -> None:
+    @app.get("/events", summary="What happened, as Server-Sent Events", tags=["node"], response_class=StreamingResponse)
+    async def stream(
+        after: int | None = Query(default=None, ge=0, le=2**53, description="replay from the event after this id"),
+        follow: bool = Query(default=True, description="false: end after what is known now"),
+        last_event_id: str = Header(default="", max_length=20),
+    ) -> StreamingResponse:
+        start = after if after is not None else _number(last_event_id, events.last_id)
+        source = _stream(events, start) if follow else _replay(events, start)
+        return StreamingResponse(source, media_type="text/event-stream", headers={"cache-control": "no-store"})
+
+
+def _number(text: str, otherwise: int) -> int:
+    return int(text) if text.isascii() and text.isdigit() else otherwise
+
+
+def _sse(entry: HistoryEntry) -> str:
+    return f"id: {entry.id}\nevent: {entry.kind}\ndata: {entry.model_dump_json()}\n\n"
+
+
+async def _replay(events: EventLog, after: int) -> AsyncIterator[str]:
+    for entry in events.since(after):
+        yield _sse(entry)
+
+
+async def _stream(events: EventLog, after: int) -> AsyncIterator[str]:
+    yield ": listening\n\n"
+    follower = events.follow(after)
+    while True:
+        following = asyncio.ensure_future(anext(follower))
+        try:
+            while not (await asyncio.wait({following}, timeout=SSE_SILENCE_S))[0]:
+                yield ": nothing new\n\n"
+            entry = following.result()
+        finally:
+            following.cancel()
+        yield _sse(entry)

@@ -1,0 +1,253 @@
+"""Asking other nodes: one document out, one checked document back."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, Protocol, TypeVar, cast
+
+import httpx
+from pydantic import TypeAdapter, ValidationError
+
+from core.clock import Clock
+from core.errors import (
+    BadRequest,
+    Conflict,
+    Forbidden,
+    GardenError,
+    NotFound,
+    PeerDown,
+    PreconditionFailed,
+    Refused,
+    StorageError,
+    TooLarge,
+    Unauthorised,
+    Unavailable,
+    Unprocessable,
+)
+from core.mesh.auth import Identity
+from core.mesh.peers import Peer
+from core.wire.documents import Document, Problem
+
+D = TypeVar("D")
+T = TypeVar("T")
+ANSWER_BYTES_MAX = 4 * 1024 * 1024
+AT_ONCE_MAX = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What came back, unread."""
+
+    status: int
+    body: bytes
+    headers: Mapping[str, str] = field(default_factory=dict)
+    """Names in lower case."""
+
+
+class PeerTransport(Protocol):
+    """Carries one request. `OSError` or `httpx.TransportError` mean that nobody answered."""
+
+    async def send(self, method: str, url: str, headers: Mapping[str, str], body: bytes) -> Answer: ...
+
+    async def aclose(self) -> None: ...
+
+
+class HttpxTransport:
+    """Any httpx transport (`httpx.ASGITransport`, the lab's in-memory mesh) as a PeerTransport."""
+
+    def __init__(self, inner: httpx.AsyncBaseTransport) -> None:
+        self._inner = inner
+
+    async def send(self, method: str, url: str, headers: Mapping[str, str], body: bytes) -> Answer:
+        request = httpx.Request(method, url, headers=headers, content=body)
+        response = await self._inner.handle_async_request(request)
+        try:
+            content = await response.aread()
+        finally:
+            await response.aclose()
+        return Answer(response.status_code, content, {name.lower(): value for name, value in response.headers.items()})
+
+    async def aclose(self) -> None:
+        await self._inner.aclose()
+
+
+class Mesh:
+    """Calls to peers, signed with this node's token. Time-outs are seconds of the loop, not of the garden."""
+
+    def __init__(
+        self,
+        transport: PeerTransport | httpx.AsyncBaseTransport,
+        identity: Identity | None,
+        clock: Clock,
+        timeout_s: float = 2.0,
+    ) -> None:
+        wrap = isinstance(transport, httpx.AsyncBaseTransport)
+        self._transport: PeerTransport = HttpxTransport(transport) if wrap else transport  # type: ignore[arg-type, assignment]
+        self._headers = {"authorization": f"Bearer {identity.token}"} if identity else {}
+        self._clock = clock
+        self._timeout_s = timeout_s
+
+    async def call(
+        self,
+        peer: Peer,
+        method: str,
+        path: str,
+        body: Document | None = None,
+        *,
+        expect: type[D],
+        key: str = "",
+        timeout_s: float | None = None,
+    ) -> D:
+        """Ask one peer; `expect` is the answer's model (or `list[Model]`). `key` makes a POST safe to repeat.
+
+        Raises PeerDown when nobody answered in time or the answer is nonsense, else the error the peer's problem names.
+        """
+        answer = await self.exchange(peer, method, path, _dump(body), key=key, timeout_s=timeout_s)
+        return _read(peer, answer, expect)
+
+    async def exchange(
+        self,
+        peer: Peer,
+        method: str,
+        path: str,
+        body: bytes = b"",
+        *,
+        key: str = "",
+        headers: Mapping[str, str] | None = None,
+        timeout_s: float | None = None,
+    ) -> Answer:
+        """The raw answer, whatever its status; raises PeerDown when there is none."""
+        sent = self._sent(body, key) | dict(headers or {})
+        limit_s = self._timeout_s if timeout_s is None else timeout_s
+        try:
+            async with asyncio.timeout(limit_s):
+                return await self._transport.send(method, peer.url + path, sent, body)
+        except TimeoutError as error:
+            raise PeerDown(f"{peer.id} did not answer {method} {path} within {limit_s:g} s") from error
+        except (OSError, httpx.TransportError, EOFError) as error:
+            raise PeerDown(f"{peer.id} is not reachable at {peer.url}: {error or type(error).__name__}") from error
+
+    async def ask_all(
+        self,
+        peers: Iterable[Peer],
+        method: str,
+        path: str,
+        body: Document | None = None,
+        *,
+        expect: type[D],
+        timeout_s: float | None = None,
+        each: Callable[[str, D | GardenError], None] | None = None,
+    ) -> dict[str, D | GardenError]:
+        """Ask many at once, the body serialised once; every peer has its entry, an error in place of a missing answer.
+
+        `each` is called with every peer's answer as it comes in.
+        """
+        content = _dump(body)
+        answers: dict[str, D | GardenError] = {}
+        gate = asyncio.Semaphore(AT_ONCE_MAX)
+
+        async def ask(peer: Peer) -> None:
+            try:
+                async with gate:
+                    answer = await self.exchange(peer, method, path, content, timeout_s=timeout_s)
+                answers[peer.id] = _read(peer, answer, expect)
+            except GardenError as error:
+                answers[peer.id] = error
+            if each is not None:
+                each(peer.id, answers[peer.id])
+
+        asked = list(peers)
+        async with asyncio.TaskGroup() as group:
+            for peer in asked:
+                group.create_task(ask(peer))
+        return {peer.id: answers[peer.id] for peer in asked}
+
+    def _sent(self, body: bytes, key: str) -> dict[str, str]:
+        headers = dict(self._headers)
+        if body:
+            headers["content-type"] = "application/json"
+        if key:
+            headers["idempotency-key"] = key
+        return headers
+
+    async def aclose(self) -> None:
+        await self._transport.aclose()
+
+
+def _dump(body: Document | None) -> bytes:
+    return b"" if body is None else body.model_dump_json().encode()
+
+
+@lru_cache(maxsize=256)
+def _adapter(expect: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(expect)
+
+
+def _read(peer: Peer, answer: Answer, expect: type[D]) -> D:
+    if answer.status >= 400:
+        raise _error(peer, answer)
+    if len(answer.body) > ANSWER_BYTES_MAX:
+        raise PeerDown(f"{peer.id} answered with {len(answer.body)} bytes, more than we read")
+    try:
+        value: D = _adapter(cast(Any, expect)).validate_json(answer.body)
+    except (ValidationError, ValueError) as error:
+        raise PeerDown(f"{peer.id} answered something else than expected: {str(error)[:200]}") from error
+    return value
+
+
+_ERRORS: dict[int, type[GardenError]] = {
+    400: BadRequest,
+    401: Unauthorised,
+    403: Forbidden,
+    404: NotFound,
+    409: Conflict,
+    412: PreconditionFailed,
+    413: TooLarge,
+    422: Unprocessable,
+    503: Unavailable,
+    507: StorageError,
+}
+
+
+def _error(peer: Peer, answer: Answer) -> GardenError:
+    """The error a problem document stands for; its `status` is the answer's."""
+    try:
+        problem = Problem.model_validate_json(answer.body)
+    except ValidationError:
+        problem = Problem(title="", status=answer.status, detail=f"{peer.id} answered {answer.status} without saying why")
+    cls = Refused if problem.title == Refused.title else _ERRORS.get(answer.status)
+    if cls is None:
+        cls = BadRequest if answer.status < 500 else GardenError
+    error = cls(problem.detail or problem.title, hint=problem.hint)
+    error.status = answer.status
+    return error
+
+
+class Chance(Protocol):
+    """`random.Random` and `numpy.random.Generator` both are one."""
+
+    def random(self) -> float: ...
+
+
+async def retry(
+    clock: Clock,
+    rng: Chance,
+    attempt: Callable[[], Awaitable[T]],
+    *,
+    tries: int = 5,
+    base_s: float = 0.2,
+    cap_s: float = 5.0,
+) -> T:
+    """Try again while the answer is Unavailable, after a random part of a doubling, capped wait [garden s].
+
+    The last error is raised as it came. (Full jitter: Brooker, Exponential Backoff and Jitter.)
+    """
+    for done in range(tries - 1):
+        try:
+            return await attempt()
+        except Unavailable:
+            await clock.sleep(min(cap_s, base_s * 2**done) * rng.random())
+    return await attempt()

@@ -1,0 +1,158 @@
+"""What every service process does before it is itself: settings, logs, clock, keys, peers."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import structlog
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from core.clock import Clock, WallClock, WorldClock
+from core.errors import ConfigError, GardenError
+from core.mesh.auth import Identity, Verifier
+from core.mesh.client import Mesh, PeerTransport
+from core.mesh.node import Loop, Node, serve
+from core.mesh.peers import Peer, Peers
+
+FIRST_TIME_WITHIN_S = 15.0
+
+
+class GardenSettings(BaseSettings):
+    """What all services share; read from `GARDEN_...` variables."""
+
+    model_config = SettingsConfigDict(env_prefix="GARDEN_", frozen=True)
+
+    clock: Annotated[str, Field(pattern=r"^(wall|https?://\S+)$")] = "wall"
+    """`wall`, or the URL of the world whose time is followed."""
+    keys: Path | None = None
+    """This node's own key folder; without one the node has no identity and accepts no change."""
+    peers: list[Peer] = []
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 0
+    log: Literal["auto", "json", "text"] = "auto"
+    open_reads: bool = True
+    """Reading needs no token. Right only while the port is published on loopback."""
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Runtime:
+    """The common parts, made for one process."""
+
+    settings: GardenSettings
+    clock: Clock
+    clock_loops: Sequence[Loop]
+    identity: Identity | None
+    verifier: Verifier
+    peers: Peers
+    transport: PeerTransport
+
+    def mesh(self, timeout_s: float = 2.0) -> Mesh:
+        return Mesh(self.transport, self.identity, self.clock, timeout_s)
+
+
+def make_clock(settings: GardenSettings) -> tuple[Clock, Sequence[Loop]]:
+    """The clock `GARDEN_CLOCK` names, and the loops that keep it right."""
+    if settings.clock == "wall":
+        return WallClock(), ()
+    from core.mesh import worldclock
+
+    clock = WorldClock()
+    return clock, (lambda: worldclock.follow(clock, settings.clock),)
+
+
+def make_runtime(settings: GardenSettings | None = None) -> Runtime:
+    """Call inside the running loop; raises ConfigError for missing or broken key files."""
+    from core.mesh.aio import AiohttpTransport
+
+    settings = settings or GardenSettings()
+    clock, clock_loops = make_clock(settings)
+    if settings.keys is None:
+        raise ConfigError("GARDEN_KEYS names no key folder", hint="run `garden init`, then set GARDEN_KEYS=DATA/keys/NODE")
+    identity, verifier = Identity.load(settings.keys), Verifier.load(settings.keys)
+    return Runtime(settings, clock, clock_loops, identity, verifier, Peers(settings.peers), AiohttpTransport())
+
+
+def setup_logging(how: str = "auto") -> None:
+    """structlog to stderr: JSON lines, or text on a terminal. The standard library's warnings go the same way."""
+    text = how == "text" or (how == "auto" and sys.stderr.isatty())
+    final = structlog.dev.ConsoleRenderer() if text else structlog.processors.JSONRenderer()
+    structlog.configure(
+        processors=[
+            structlog.contextvars.merge_contextvars,
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso"),
+            structlog.processors.dict_tracebacks if not text else structlog.processors.StackInfoRenderer(),
+            final,
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        cache_logger_on_first_use=True,
+    )
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(name)s: %(message)s")
+
+
+Builder = Callable[[Runtime], Awaitable[Node]]
+
+
+def run(build: Builder) -> None:
+    """A service's whole `main`: build the node, serve it, end with 0 on SIGTERM and 1 on any failure."""
+    try:
+        settings = GardenSettings()
+    except ValueError as error:
+        sys.exit(f"a GARDEN_ setting is wrong: {error}")
+    setup_logging(settings.log)
+    log = structlog.get_logger("garden.run")
+    try:
+        asyncio.run(_run(build, settings))
+    except GardenError as error:
+        log.error("cannot start", why=str(error), hint=error.hint)
+        sys.exit(1)
+    except Exception as error:
+        for cause in _causes(error):
+            log.error("ended by an error", why=f"{type(cause).__name__}: {cause}", exc_info=cause)
+        sys.exit(1)
+
+
+def _causes(error: BaseException) -> list[BaseException]:
+    if isinstance(error, BaseExceptionGroup):
+        return [cause for inner in error.exceptions for cause in _causes(inner)]
+    return [error]
+
+
+async def _run(build: Builder, settings: GardenSettings) -> None:
+    runtime = make_runtime(settings)
+    try:
+        async with asyncio.TaskGroup() as group:
+            clocks = [group.create_task(_endless(loop)) for loop in runtime.clock_loops]
+            await _first_time(runtime.clock)
+            node = await build(runtime)
+            structlog.contextvars.bind_contextvars(node=node.id)
+            await serve(node, settings.host, settings.port)
+            for task in clocks:
+                task.cancel()
+    finally:
+        await runtime.transport.aclose()
+
+
+async def _endless(loop: Loop) -> None:
+    await loop()
+
+
+async def _first_time(clock: Clock) -> None:
+    """Wait for the world's first word, so that no loop sees garden time jump from zero."""
+    if not isinstance(clock, WorldClock):
+        return
+    try:
+        async with asyncio.timeout(FIRST_TIME_WITHIN_S):
+            while clock.rate == 0 and clock.now() == 0:  # noqa: ASYNC110 (the clock has no event for its first word)
+                await asyncio.sleep(0.02)
+    except TimeoutError:
+        raise ConfigError("the world tells no time", hint="is GARDEN_CLOCK the URL of a running sim?") from None

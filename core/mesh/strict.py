@@ -1,0 +1,106 @@
+"""Reading request bodies without mercy: JSON as RFC 8259 has it, every key once, every number finite."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, TypeVar
+
+from fastapi import Depends, Request
+from pydantic import BaseModel, ValidationError
+
+from core.errors import BadRequest, Unprocessable
+
+M = TypeVar("M", bound=BaseModel)
+DEPTH_MAX = 32
+
+
+def body(model: type[M]) -> Any:
+    """`request: WaterRequest = body(WaterRequest)` in an endpoint: the body, checked strictly."""
+    return Depends(Reader(model))
+
+
+class Reader:
+    """The dependency behind `body`; `create_app` finds it to describe the body in the OpenAPI document."""
+
+    def __init__(self, model: type[BaseModel]) -> None:
+        self.model = model
+
+    async def __call__(self, request: Request) -> Any:
+        return parse(self.model, await request.body())
+
+
+def parse(model: type[M], raw: bytes) -> M:
+    """One document from bytes; raises BadRequest for what is not JSON, Unprocessable for what is not this document."""
+    _check_json(raw)
+    try:
+        return model.model_validate_json(raw, strict=True)
+    except ValidationError as error:
+        raise Unprocessable(_told(error), hint=f"a {model.__name__} as in /openapi.json") from error
+
+
+def _told(error: ValidationError) -> str:
+    parts = []
+    for item in error.errors(include_url=False, include_context=False, include_input=False)[:8]:
+        where = ".".join(str(part) for part in item["loc"])
+        parts.append(f"{where}: {item['msg']}" if where else item["msg"])
+    return "; ".join(parts)[:1000]
+
+
+def _check_json(raw: bytes) -> None:
+    """What pydantic's parser lets pass: doubled keys, NaN, numbers beyond a float, bottomless nesting."""
+    if not raw:
+        raise BadRequest("the body is empty", hint="send a JSON object")
+    try:
+        value = json.loads(raw.decode("utf-8"), object_pairs_hook=_once, parse_constant=_no_constant, parse_float=_finite)
+    except RecursionError:
+        raise BadRequest("the body is nested too deeply") from None
+    except UnicodeDecodeError:
+        raise BadRequest("the body is not UTF-8") from None
+    except ValueError as error:
+        raise BadRequest(f"the body is not JSON: {error}"[:300]) from None
+    if _deeper(value, DEPTH_MAX):
+        raise BadRequest(f"the body is nested more than {DEPTH_MAX} deep")
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    document = dict(pairs)
+    if len(document) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {twice[:40]!r} comes twice")
+    return document
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if value in (float("inf"), float("-inf")):
+        raise ValueError(f"{text[:40]} is too large")
+    return value
+
+
+def _deeper(value: Any, depth: int) -> bool:
+    """Whether containers in `value` nest more than `depth` deep."""
+    level = [value]
+    for _ in range(depth):
+        level = [inner for item in level for inner in _inside(item)]
+        if not level:
+            return False
+    return any(isinstance(item, dict | list) for item in level)
+
+
+def _inside(item: Any) -> list[Any]:
+    if isinstance(item, dict):
+        return list(item.values())
+    return item if isinstance(item, list) else []
+
+
+def readers(dependant: Any) -> list[Reader]:
+    """Every `body(...)` of a route, also of its dependencies."""
+    found = [dependant.call] if isinstance(dependant.call, Reader) else []
+    for inner in dependant.dependencies:
+        found += readers(inner)
+    return found
