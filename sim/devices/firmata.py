@@ -27,28 +27,19 @@ SAMPLING_S_MIN = 0.001
 class FirmataEmulator:
     """Fills `Emulator` over `BoardPins`.
 
-    `noise_v` is the standard deviation of probe and converter noise, added to what the pins say; `freeze` holds a
-    converter's code still, which is what a stuck probe looks like.
+    A probe's noise belongs to the pins; `noise_v` is the standard deviation of the converter's own, drawn from `rng`.
     """
 
     def __init__(
-        self, pins: BoardPins, rng: random.Random, vref_v: float = 5.0, bits: int = 10, *, noise_v: float = 0.0025
+        self, pins: BoardPins, rng: random.Random, vref_v: float = 5.0, bits: int = 10, *, noise_v: float = 0.0
     ) -> None:
         self._pins, self._rng = pins, rng
         self._vref_v, self._bits, self._noise_v = vref_v, bits, noise_v
         self._reader, self._out = wire.FirmataReader(to_host=False), Outbox()
         self._levels = [False] * PINS
-        self._frozen: dict[int, int] = {}
         self._sample_s = math.inf
         self._reset()
         self._out.put(wire.encode_version(*FIRMWARE[:2]) + wire.encode_firmware(*FIRMWARE), 0.0)
-
-    def freeze(self, channel: int, frozen: bool) -> None:
-        """Hold the analog channel's code where it is now, or let it follow the pin again."""
-        if frozen:
-            self._frozen.setdefault(channel, self._convert(channel))
-        else:
-            self._frozen.pop(channel, None)
 
     def receive(self, data: bytes, now_s: float) -> None:
         self.step(now_s)
@@ -143,13 +134,9 @@ class FirmataEmulator:
         mask = sum(1 << pin - port * 8 for pin in pins if self._modes[pin] == wire.MODE_PULLUP)
         self._say(wire.encode_digital(port, mask), now_s)
 
-    def _convert(self, channel: int) -> int:
+    def _read(self, channel: int) -> int:
         noise_v = self._rng.gauss(0.0, self._noise_v) if self._noise_v > 0 else 0.0
         return code_of(self._pins.analog_v(channel) + noise_v, self._vref_v, self._bits)
-
-    def _read(self, channel: int) -> int:
-        frozen = self._frozen.get(channel)
-        return self._convert(channel) if frozen is None else frozen
 
     def _write_port(self, port: int, mask: int) -> None:
         for pin in range(port * 8, min(PINS, port * 8 + 8)):
