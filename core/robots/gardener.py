@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 BODY_RADIUS_M = 0.174
 BODY_HEIGHT_M = 0.09
@@ -106,8 +107,19 @@ CAMERA_IN_HAND_M = (0.03, 0.0, 0.045)
 """Camera centre from the wrist axis along (hand x, y, z); it looks along hand x."""
 NOZZLE_IN_HAND_M = (0.11, 0.0, -0.02)
 
-ARM_HOME_RAD = (0.0, math.radians(150.0), math.radians(-150.0), math.radians(0.0))
+ARM_HOME_RAD = (0.0, math.radians(150.0), math.radians(-150.0), math.radians(60.0))
 """Folded over the body: within the footprint while driving."""
+
+
+def gripper_opening_m(servo_rad: float) -> float:
+    """Gripper servo angle -> gap between the fingers: closed at 0, `GRIPPER_OPEN_M` at the servo's end, linear."""
+    return GRIPPER_OPEN_M * servo_rad / SERVOS["gripper"].max_rad
+
+
+def gripper_rad(opening_m: float) -> float:
+    """Gap between the fingers -> gripper servo angle; the inverse of `gripper_opening_m`."""
+    return SERVOS["gripper"].max_rad * opening_m / GRIPPER_OPEN_M
+
 
 # How a robot stands at a pot
 DOCK_TO_STEM_M = 0.55
@@ -119,6 +131,8 @@ SOIL_RADIUS_M = 0.12
 SOIL_HEIGHT_M = 0.25
 NOZZLE_POINT_M = (0.06, 0.0, 0.06)
 """Where the water should leave, in the plant frame (origin: soil centre; x towards the dock, z up)."""
+DOCK_RED_SIDE: Literal["left", "right"] = "left"
+"""On which side of a dock's centre line only the red beam is seen, for a robot that faces the dock."""
 WATCHDOG_LENGTH_M = 1.5
 WATCHDOG_WIDTH_M = 1.0
 """While docking the robot stays in this rectangle before the dock, or goes back to the launch point (paper, 8.2)."""

@@ -1,0 +1,1 @@
+"""What the emulated devices feel and move, one idea a file."""
