@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from sim.devices.create_dock import Side
@@ -64,7 +65,7 @@ class BenchCreate:
         self.capacity_ah = 6.77
         self.extra: dict[str, bool] = {}
         """Senses forced from outside, by field name of CreateSense: cliffs, drops, bumps."""
-        self.may_charge = lambda: True
+        self.may_charge: Callable[[], bool] = lambda: True
 
     @property
     def wheels(self) -> tuple[float, float]:
