@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import aiohttp
 from yarl import URL
 
-from core.errors import PeerDown
 from core.mesh.client import Answer
 
 KEPT_S = 25.0
@@ -15,7 +14,7 @@ KEPT_S = 25.0
 
 
 class AiohttpTransport:
-    """A PeerTransport that scales to hundreds of hosts. The caller holds the time-out."""
+    """A PeerTransport that scales to hundreds of hosts. The caller holds the time-out. Nobody there is an OSError."""
 
     def __init__(self) -> None:
         self._session: aiohttp.ClientSession | None = None
@@ -29,9 +28,9 @@ class AiohttpTransport:
             except aiohttp.ServerDisconnectedError as error:
                 # A kept connection that the peer had closed meanwhile: a GET may simply be asked again.
                 if not again:
-                    raise PeerDown(f"{url} closed the connection") from error
+                    raise ConnectionResetError("it closed the connection") from error
             except aiohttp.ClientError as error:
-                raise PeerDown(f"{url}: {error}") from error
+                raise ConnectionError(str(error)) from error
         raise AssertionError("unreachable")
 
     async def _exchange(

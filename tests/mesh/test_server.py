@@ -1,0 +1,162 @@
+"""The real server on a real socket: impatient, bounded, clean in its end."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from core.clock import WallClock
+from core.errors import ConfigError, PeerDown
+from core.mesh import server as server_module
+from core.mesh.aio import AiohttpTransport
+from core.mesh.chassis import Health, body, create_app
+from core.mesh.client import Mesh
+from core.mesh.events import EventLog
+from core.mesh.node import Node, serve
+from core.mesh.peers import Peer
+from core.mesh.server import listen
+from core.wire.documents import NodeCard, Problem
+
+Story = Callable[[int], Awaitable[None]]
+
+
+async def with_server(story: Story, *loops: Callable[[], Awaitable[None]]) -> None:
+    """Serve on a free port, run the story against it, end by SIGTERM as a process manager would."""
+    clock = WallClock()
+    card = NodeCard(id="pot", kind="plant")
+    app = create_app(card=lambda: card, clock=clock, verifier=None, ready=lambda: [], events=EventLog(clock))
+
+    @app.post("/x")
+    async def takes_a_body(health: Health = body(Health)) -> Health:
+        return health
+
+    sock = listen("127.0.0.1", 0)
+    serving = asyncio.create_task(serve(Node("pot", "plant", app, loops), "", 0, sock=sock))
+    try:
+        async with asyncio.timeout(8):
+            await story(sock.getsockname()[1])
+            os.kill(os.getpid(), signal.SIGTERM)
+            await serving
+    finally:
+        serving.cancel()
+
+
+async def talk(port: int, data: bytes) -> bytes:
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(data)
+    answer = await reader.read(-1)
+    writer.close()
+    return answer
+
+
+def test_requests_that_do_not_arrive_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "REQUEST_WITHIN_S", 0.15)
+
+    async def story(port: int) -> None:
+        halves = (
+            b"",
+            b"GET / HT",
+            b"GET / HTTP/1.1\r\nhost: a\r\n",
+            b"POST /x HTTP/1.1\r\nhost: a\r\ncontent-length: 9\r\n\r\n{",
+        )
+        for half in halves:
+            assert b" 408 " in await talk(port, half)
+
+    asyncio.run(with_server(story))
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        b"\x16\x03\x01\x02\x00\n\n",
+        b"GET\r\n\r\n",
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nhost: a\r\nx: " + b"y" * 20000,
+    ],
+)
+def test_what_is_not_http_gets_a_problem_and_a_closed_door(nonsense: bytes) -> None:
+    async def story(port: int) -> None:
+        answer = await talk(port, nonsense)
+        assert answer.startswith(b"HTTP/1.1 400 ")
+        Problem.model_validate_json(answer.partition(b"\r\n\r\n")[2])
+
+    asyncio.run(with_server(story))
+
+
+def test_two_lengths_are_refused_on_the_wire() -> None:
+    async def story(port: int) -> None:
+        head = b"POST / HTTP/1.1\r\nhost: a\r\nconnection: close\r\ncontent-length: 3\r\ntransfer-encoding: chunked\r\n\r\n"
+        assert b" 400 " in await talk(port, head + b"0\r\n\r\n")
+
+    asyncio.run(with_server(story))
+
+
+def test_the_real_transport_reaches_the_real_server_and_events_stream() -> None:
+    async def story(port: int) -> None:
+        transport = AiohttpTransport()
+        mesh = Mesh(transport, None, WallClock())
+        peer = Peer(id="pot", kind="plant", url=f"http://127.0.0.1:{port}")
+        assert await mesh.call(peer, "GET", "/healthz", expect=Health) == Health()
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"GET /events HTTP/1.1\r\nhost: a\r\n\r\n")
+        assert b": listening" in await reader.readuntil(b"listening")
+        writer.close()
+        with pytest.raises(PeerDown, match="nobody"):
+            await mesh.call(
+                Peer(id="nobody", kind="plant", url=f"http://127.0.0.1:{free_port()}"), "GET", "/", expect=Health
+            )
+        await transport.aclose()
+
+    asyncio.run(with_server(story))
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+def test_a_loop_that_dies_ends_the_node() -> None:
+    async def dies() -> None:
+        await asyncio.sleep(0.05)
+        raise ZeroDivisionError
+
+    async def forever(port: int) -> None:
+        await asyncio.sleep(5)
+
+    async def go() -> None:
+        app = create_app(card=lambda: NodeCard(id="a", kind="b"), clock=WallClock(), verifier=None, ready=lambda: [])
+        await serve(Node("a", "b", app, [dies]), "127.0.0.1", 0)
+
+    with pytest.raises(ExceptionGroup) as caught:
+        asyncio.run(go())
+    assert caught.group_contains(ZeroDivisionError)
+
+
+def test_loops_are_cancelled_when_the_node_ends() -> None:
+    ended: list[bool] = []
+
+    async def loop() -> None:
+        try:
+            await asyncio.sleep(100)
+        finally:
+            ended.append(True)
+
+    async def story(port: int) -> None:
+        await asyncio.sleep(0)
+
+    asyncio.run(with_server(story, loop))
+    assert ended == [True]
+
+
+def test_a_taken_port_is_named() -> None:
+    with listen("127.0.0.1", 0) as sock:
+        port = sock.getsockname()[1]
+        with pytest.raises(ConfigError, match=str(port)):
+            listen("127.0.0.1", port)
