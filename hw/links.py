@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Protocol
 from urllib.parse import parse_qs, urlsplit
@@ -112,6 +113,8 @@ class MemoryLink:
     def __init__(self, name: str, clock: Clock, latency_s: float) -> None:
         self._name, self._clock, self._latency_s = name, clock, latency_s
         self._buffer = bytearray()
+        self._flight: deque[bytes | None] = deque()
+        """On the way to the peer, oldest first; None is the end. The loop's timers of one instant fire in any order."""
         self._arrived = asyncio.Event()
         self._closed = False
         self.peer: MemoryLink | None = None
@@ -136,12 +139,25 @@ class MemoryLink:
         if self._closed or self.peer is None:
             raise LinkDown(f"{self._name} is closed")
         if not self.muted and data:
-            asyncio.get_running_loop().call_later(self._latency_s, self.peer._deliver, bytes(data))
+            self._launch(bytes(data))
 
     async def close(self) -> None:
         self._shut()
         if self.peer is not None and not self.muted:
-            asyncio.get_running_loop().call_later(self._latency_s, self.peer._shut)
+            self._launch(None)
+
+    def _launch(self, data: bytes | None) -> None:
+        self._flight.append(data)
+        asyncio.get_running_loop().call_later(self._latency_s, self._land)
+
+    def _land(self) -> None:
+        data = self._flight.popleft()
+        if self.peer is None:
+            return
+        if data is None:
+            self.peer._shut()
+        else:
+            self.peer._deliver(data)
 
     def cut(self) -> None:
         """The owner died: nothing written from now on arrives, and the other side sees the end."""

@@ -32,7 +32,7 @@ class _Channel:
     sent_us: float = -1.0
 
     def pulse_us(self, now_s: float) -> float:
-        if now_s >= self.end_s:
+        if now_s >= self.end_s - 1e-9:
             return self.target_us
         done = (now_s - self.start_s) / (self.end_s - self.start_s)
         return self.start_us + (self.target_us - self.start_us) * max(0.0, done)
@@ -46,10 +46,12 @@ class _Input:
 
 
 class Ssc32Emulator:
-    """Fills `Emulator` over a `ServoRig`. `rng` is the last bit's noise of the analog inputs."""
+    """Fills `Emulator` over a `ServoRig`. `noise_counts` is the converter's own noise, drawn from `rng`."""
 
-    def __init__(self, rig: ServoRig, rng: random.Random, version: str = "SSC32-V2.50USB") -> None:
-        self._rig, self._rng, self._version = rig, rng, version
+    def __init__(
+        self, rig: ServoRig, rng: random.Random, version: str = "SSC32-V2.50USB", *, noise_counts: float = 0.0
+    ) -> None:
+        self._rig, self._rng, self._version, self._noise_counts = rig, rng, version, noise_counts
         self._lines, self._out = wire.LineReader(), Outbox()
         self._channels: dict[int, _Channel] = {}
         self._moving: set[int] = set()
@@ -187,8 +189,8 @@ class Ssc32Emulator:
         if not pin.analog:
             pin.analog = True
             return UNSETTLED_COUNT
-        noise_v = self._rng.gauss(0.0, 0.25) * wire.VOLTS_PER_COUNT
-        return wire.count_of(self._volts(index) + noise_v)
+        noise = self._rng.gauss(0.0, self._noise_counts) if self._noise_counts > 0 else 0.0
+        return wire.count_of(self._volts(index) + noise * wire.VOLTS_PER_COUNT)
 
     def _read_digital(self, index: int, latch: bool, now_s: float) -> str:
         pin = self._inputs[index]
