@@ -30,18 +30,18 @@ _WINDOW_S = 0.5
 class Moving(Protocol):
     """The part of the world that time moves."""
 
-    @property
-    def now_s(self) -> float: ...
+    time_s: float
 
-    def advance(self, dt_s: float) -> None:
+    @property
+    def at_rest(self) -> bool: ...
+
+    def advance(self, seconds: float) -> None:
         """Full physics."""
         ...
 
-    def stride(self, dt_s: float) -> None:
+    def stride(self, seconds: float) -> None:
         """Only what goes on while nothing moves: soil, batteries, growth."""
         ...
-
-    def at_rest(self) -> bool: ...
 
 
 class Host(Protocol):
@@ -76,7 +76,7 @@ class Clockwork:
         self._speed, self._paused = speed, False
         self._clock: Clock | None = None
         self._anchor_clock_s = self._anchor_garden_s = 0.0
-        self._until_s = world.now_s
+        self._until_s = world.time_s
         self._rate = 0.0
         self._window = (0.0, 0.0)
         self._woken = asyncio.Event()
@@ -94,13 +94,19 @@ class Clockwork:
         return self._paused
 
     @property
+    def running(self) -> bool:
+        return self._clock is not None
+
+    @property
     def rate(self) -> float:
         """Garden seconds a second, as achieved of late; 0 while paused."""
         return 0.0 if self._paused or self._clock is None else self._rate
 
     def steer(self, *, speed: float | None = None, paused: bool | None = None) -> None:
         """Change the speed, or pause and go on."""
-        self._catch_up_anchor()
+        self.catch_up()
+        if self._clock is not None:
+            self._anchor()
         self._speed = self._speed if speed is None else speed
         self._paused = self._paused if paused is None else paused
         self._rate = self._speed
@@ -120,7 +126,7 @@ class Clockwork:
             news = self._news
             yield self.beat()
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(BEAT_IDLE_S if self._resting() else BEAT_S):
+                async with asyncio.timeout(BEAT_IDLE_S if self._world.at_rest else BEAT_S):
                     await news.wait()
 
     async def run(self, clock: Clock) -> None:
@@ -133,7 +139,7 @@ class Clockwork:
             while True:
                 await self._beat_once(clock)
         finally:
-            self._catch_up_anchor()
+            self.catch_up()
             self._clock = None
             self._tell()
 
@@ -144,15 +150,15 @@ class Clockwork:
             await self._woken.wait()
             self._anchor()
             return
-        resting = self._resting()
+        resting = self._world.at_rest
         step_s = self._stride_s() if resting else TICK_S
-        self._until_s = self._world.now_s + step_s
+        self._until_s = self._world.time_s + step_s
         wait_s = self._due_clock_s(self._until_s) - clock.now()
         if resting:
             await self._doze(clock, wait_s)
             if self._paused:
                 return
-            step_s = min(step_s, max(self._garden_s() - self._world.now_s, 0.0))
+            step_s = min(step_s, max(self._garden_s() - self._world.time_s, 0.0))
         else:
             await clock.sleep(wait_s)
             self._allow_for_lag(-wait_s)
@@ -168,17 +174,14 @@ class Clockwork:
             self.strides += 1
         else:
             self.ticks += 1
-        now_s = self._world.now_s
+        now_s = self._world.time_s
         for host in self._hosts:
             if not resting or host.due_s() <= now_s + 1e-9:
                 host.pump(now_s)
 
-    def _resting(self) -> bool:
-        return self._world.at_rest()
-
     def _stride_s(self) -> float:
         due_s = min((host.due_s() for host in self._hosts), default=float("inf"))
-        return min(max(due_s - self._world.now_s, STRIDE_S_MIN), STRIDE_S_MAX)
+        return min(max(due_s - self._world.time_s, STRIDE_S_MIN), STRIDE_S_MAX)
 
     async def _doze(self, clock: Clock, seconds: float) -> None:
         """Sleeps unless woken."""
@@ -193,26 +196,23 @@ class Clockwork:
     def _garden_s(self) -> float:
         """Garden time by the pacing clock, never beyond the tick that is being waited for."""
         if self._clock is None or self._paused:
-            return self._world.now_s
+            return self._world.time_s
         running_s = self._anchor_garden_s + (self._clock.now() - self._anchor_clock_s) * self._speed
-        return min(max(running_s, self._world.now_s), max(self._until_s, self._world.now_s))
+        return min(max(running_s, self._world.time_s), max(self._until_s, self._world.time_s))
 
     def _due_clock_s(self, garden_s: float) -> float:
         return self._anchor_clock_s + (garden_s - self._anchor_garden_s) / self._speed
 
     def _anchor(self) -> None:
         assert self._clock is not None
-        self._anchor_clock_s, self._anchor_garden_s = self._clock.now(), self._world.now_s
-        self._until_s = self._world.now_s
+        self._anchor_clock_s, self._anchor_garden_s = self._clock.now(), self._world.time_s
+        self._until_s = self._world.time_s
         self._window = (self._anchor_clock_s, self._anchor_garden_s)
 
-    def _catch_up_anchor(self) -> None:
-        """Bring a dozing world to the present before the speed changes."""
-        if self._clock is None:
-            return
-        if not self._paused and (ahead_s := self._garden_s() - self._world.now_s) > 0 and self._resting():
+    def catch_up(self) -> None:
+        """Bring a dozing world to the present: before it is looked at or changed from outside."""
+        if (ahead_s := self._garden_s() - self._world.time_s) > 0 and self._world.at_rest:
             self._world.stride(ahead_s)
-        self._anchor()
 
     def _allow_for_lag(self, late_s: float) -> None:
         """Garden time slows: what cannot be caught up is forgotten."""
@@ -225,8 +225,8 @@ class Clockwork:
         passed_s = clock.now() - clock_s
         if passed_s < _WINDOW_S:
             return
-        self._window = (clock.now(), self._world.now_s)
-        rate = min((self._world.now_s - garden_s) / passed_s, self._speed)
+        self._window = (clock.now(), self._world.time_s)
+        rate = min((self._world.time_s - garden_s) / passed_s, self._speed)
         rate = self._speed if rate > 0.97 * self._speed else rate
         changed = abs(rate - self._rate) > RATE_STEP * self._speed or (rate == self._speed != self._rate)
         self._rate = rate

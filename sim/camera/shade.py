@@ -61,9 +61,7 @@ def cast_shadow(lamp: Lamp, geoms: Geoms, centre_m: Sequence[float], reach_m: fl
     fov_deg = 2 * math.degrees(math.asin(min(0.99, reach_m / float(np.linalg.norm(target - eye)))))
     camera = from_fov(SHADOW_PIXELS, SHADOW_PIXELS, fov_deg)
     T_world_lamp = look_at(eye, target, np.array([0.0, 1.0, 0.01]))
-    return ShadowMap(
-        camera=camera, T_world_lamp=T_world_lamp, distance_m=rasterise(camera, T_world_lamp, geoms).distance_m
-    )
+    return ShadowMap(camera=camera, T_world_lamp=T_world_lamp, distance_m=rasterise(camera, T_world_lamp, geoms).distance_m)
 
 
 def shade(
@@ -181,7 +179,7 @@ def _glint(n: Floats, to_eye: Floats, lx: float, ly: float, lz: float) -> float:
     hx, hy, hz = lx + to_eye[0], ly + to_eye[1], lz + to_eye[2]
     length = math.sqrt(hx * hx + hy * hy + hz * hz)
     cosine = (n[0] * hx + n[1] * hy + n[2] * hz) / max(length, 1e-9)
-    return max(cosine, 0.0) ** 40
+    return float(max(cosine, 0.0) ** 40)
 
 
 @_jit

@@ -13,20 +13,17 @@ from sim.clockwork import STRIDE_S_MAX, TICK_S, Clockwork
 
 
 class StandInWorld:
-    def __init__(self, resting: bool = True, cost_s: float = 0.0) -> None:
-        self.now_s, self.resting = 0.0, resting
+    def __init__(self, resting: bool = True) -> None:
+        self.time_s, self.at_rest = 0.0, resting
         self.steps: list[tuple[str, float]] = []
 
     def advance(self, dt_s: float) -> None:
-        self.now_s += dt_s
+        self.time_s += dt_s
         self.steps.append(("advance", dt_s))
 
     def stride(self, dt_s: float) -> None:
-        self.now_s += dt_s
+        self.time_s += dt_s
         self.steps.append(("stride", dt_s))
-
-    def at_rest(self) -> bool:
-        return self.resting
 
 
 class SlowClock(VirtualClock):
@@ -69,7 +66,7 @@ def run_for(
 def test_a_moving_world_ticks_every_20_ms_and_its_devices_run_each_tick() -> None:
     world, host = StandInWorld(resting=False), StandInHost()
     run_for(1.0, Clockwork(world, [host]), VirtualClock())
-    assert world.now_s == pytest.approx(1.0)
+    assert world.time_s == pytest.approx(1.0)
     assert {kind for kind, _ in world.steps} == {"advance"}
     assert len(host.pumped) == round(1.0 / TICK_S)
 
@@ -78,7 +75,7 @@ def test_a_resting_world_strides_and_leaves_its_devices_alone() -> None:
     world, host = StandInWorld(), StandInHost()
     run_for(10.0, Clockwork(world, [host]), VirtualClock())
     assert world.steps[:20] == [("stride", pytest.approx(STRIDE_S_MAX))] * 20
-    assert world.now_s == pytest.approx(10.0)
+    assert world.time_s == pytest.approx(10.0)
     assert host.pumped == []
 
 
@@ -110,7 +107,7 @@ def test_garden_time_runs_at_the_speed_and_follows_a_change_of_it() -> None:
         clockwork.steer(speed=10.0)
 
     run_for(3.1, clockwork, VirtualClock(), faster())
-    assert world.now_s == pytest.approx(2.1 * 3 + 1.0 * 10, abs=0.01)
+    assert world.time_s == pytest.approx(2.1 * 3 + 1.0 * 10, abs=0.01)
 
 
 @pytest.mark.parametrize("resting", [True, False])
@@ -123,15 +120,15 @@ def test_a_paused_world_stands_still_and_goes_on_where_it_was(resting: bool) -> 
         await asyncio.sleep(1.0)
         clockwork.steer(paused=True)
         await asyncio.sleep(0.1)
-        seen.append((world.now_s, clockwork.beat()))
+        seen.append((world.time_s, clockwork.beat()))
         await asyncio.sleep(4.9)
-        seen.append((world.now_s, clockwork.beat()))
+        seen.append((world.time_s, clockwork.beat()))
         clockwork.steer(paused=False)
 
     run_for(8.0, clockwork, VirtualClock(), pause())
     assert seen[0] == seen[1]
     assert seen[0][1].rate == 0
-    assert world.now_s == pytest.approx(3.0, abs=2 * TICK_S)
+    assert world.time_s == pytest.approx(3.0, abs=2 * TICK_S)
 
 
 def test_when_the_machine_is_too_slow_garden_time_slows_and_the_feed_says_so() -> None:
@@ -146,7 +143,7 @@ def test_when_the_machine_is_too_slow_garden_time_slows_and_the_feed_says_so() -
                 return
 
     run_for(3.0, clockwork, SlowClock(cost_s=0.01), listen())
-    assert world.now_s == pytest.approx(3.0 * TICK_S / 0.01, rel=0.05)
+    assert world.time_s == pytest.approx(3.0 * TICK_S / 0.01, rel=0.05)
     assert beats[-1].rate == pytest.approx(2.0, rel=0.05)
 
 
