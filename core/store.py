@@ -120,6 +120,8 @@ class DurableDocument:
         self.generation = 0
         self.alarms: list[str] = []
         self.broken = ""
+        self.failures = 0
+        """Commits that failed; whoever keeps the document in memory goes back to the last durable one."""
         self._clock, self._disk = clock, disk or Disk()
         self._lock: IO[str] | None = None
         self._queue: list[tuple[bytes | Mapping[str, Any], asyncio.Future[int]]] = []
@@ -151,6 +153,7 @@ class DurableDocument:
         Bytes must be JSON text. The document must not change while it is being saved.
         """
         if self.broken:
+            self.failures += 1
             raise StorageError(f"{self.path.name} is not durable any more: {self.broken}", hint="restart the service")
         done: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self._queue.append((doc, done))
@@ -171,6 +174,9 @@ class DurableDocument:
             try:
                 generation = await self._clock.offload(lambda doc=newest: self.commit(doc), COMMIT_COST_S)  # type: ignore[misc]
             except StorageError as error:
+                # What was queued meanwhile may build upon what just failed.
+                self.failures += 1
+                batch, self._queue = batch + self._queue, []
                 _settle(batch, error)
             else:
                 _settle(batch, generation)

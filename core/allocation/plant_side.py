@@ -38,8 +38,15 @@ from core.wire.market import (
 class Market:
     """One plant's tasks, their holders and the permit. See the module's text for the order of calls."""
 
-    def __init__(self, card: PlantCard, document: MarketDocument | None, now_s: float, rules: Rules | None = None) -> None:
-        self.card, self.rules, self.limits = card, rules or Rules(), Limits()
+    def __init__(
+        self,
+        card: PlantCard,
+        document: MarketDocument | None,
+        now_s: float,
+        rules: Rules | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        self.card, self.rules, self.limits = card, rules or Rules(), limits or Limits()
         before = document or MarketDocument()
         self._names = Names(card.plant_id, before.boot + 1)
         self._tasks = {task.task_id: task for task in before.tasks}

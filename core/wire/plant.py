@@ -35,6 +35,17 @@ class Settings(Document):
     """After a dose the water needs this long to reach the probe."""
 
 
+class SettingsPatch(Document):
+    """`PATCH /settings`: whatever is given changes, the rest stays."""
+
+    threshold_ratio: Annotated[float, Field(ge=0, le=0.6)] | None = None
+    target_ratio: Annotated[float, Field(ge=0, le=0.6)] | None = None
+    dose_ml: Annotated[float, Field(gt=0, le=500)] | None = None
+    day_cap_ml: Annotated[float, Field(gt=0, le=10000)] | None = None
+    probe_every_s: Annotated[float, Field(ge=1, le=3600)] | None = None
+    soak_s: Annotated[float, Field(ge=0, le=3600)] | None = None
+
+
 class PlantState(Document):
     """`GET /state` of a pot."""
 
@@ -82,6 +93,13 @@ class NewFruit(Document):
     robot_pose: Pose2 | None = None
     image_x_px: float | None = None
     image_y_px: float | None = None
+
+
+class Scan(Document):
+    """`POST /inventory/scans`: fruits seen, upserted by id. The same `scan_id` again changes nothing."""
+
+    scan_id: Identifier
+    fruits: Annotated[list[Fruit], Field(max_length=200)]
 
 
 class Inventory(Document):

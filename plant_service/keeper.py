@@ -1,0 +1,75 @@
+"""A state machine in memory and its document on disk: nothing is answered before the document is durable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Generic, Protocol, TypeVar
+
+from core.store import DurableDocument
+from core.wire.documents import Document
+
+
+class Machine(Protocol):
+    """Pure state; `dirty` from a change until its document is taken to be saved."""
+
+    dirty: bool
+
+    def document(self) -> Any: ...
+
+
+M = TypeVar("M", bound=Machine)
+D = TypeVar("D", bound=Document)
+T = TypeVar("T")
+
+
+class Keeper(Generic[M, D]):
+    """Runs events on a machine and saves it. A failed save takes the machine back to its last durable document."""
+
+    def __init__(self, file: DurableDocument, model: type[D], revive: Callable[[D | None], M]) -> None:
+        """Reads the file; `revive` makes the machine from its document. Raises StorageError."""
+        self._file, self._revive = file, revive
+        stored = file.load()
+        self.durable: D | None = None if stored is None else model.model_validate(stored)
+        self._machine = revive(self.durable)
+        self._failures = self._saving = 0
+
+    @property
+    def broken(self) -> str:
+        """Why nothing is acknowledged any more; empty while all is well."""
+        return self._file.broken
+
+    @property
+    def alarms(self) -> list[str]:
+        """What was found damaged on disk."""
+        return self._file.alarms
+
+    @property
+    def machine(self) -> M:
+        """The newest state; the durable one again after a failure."""
+        if self._failures != self._file.failures:
+            self._failures = self._file.failures
+            self._machine = self._revive(self.durable)
+        return self._machine
+
+    async def settle(self) -> None:
+        """Returns when the state as it is now is durable; raises StorageError when it will not be."""
+        machine = self.machine
+        if not machine.dirty and self._saving == 0:
+            return
+        machine.dirty = False
+        document: D = machine.document()
+        self._saving += 1
+        try:
+            await self._file.save(document.model_dump_json().encode())
+        finally:
+            self._saving -= 1
+        self.durable = document
+
+    async def change(self, event: Callable[[M], T]) -> T:
+        """Run an event and wait until what it did is durable."""
+        result = event(self.machine)
+        await self.settle()
+        return result
+
+    def close(self) -> None:
+        self._file.close()

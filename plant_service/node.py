@@ -1,0 +1,142 @@
+"""Builds a pot or a station: everything it needs is handed in."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from random import Random
+
+import httpx
+
+from core.allocation.docks import Docks, DocksDocument
+from core.allocation.plant_side import Market
+from core.allocation.plant_state import Limits, MarketDocument
+from core.clock import Clock
+from core.mesh.auth import Identity, Verifier
+from core.mesh.chassis import create_app
+from core.mesh.client import Mesh, PeerTransport
+from core.mesh.node import Node
+from core.mesh.peers import Peers
+from core.store import Disk, DurableDocument
+from core.wire.plant import SettingsPatch
+from hw.drivers.probes import open_probe, open_valve
+from hw.links import Opener
+from plant_service import api
+from plant_service.inventory import Fruits, InventoryDocument
+from plant_service.journal import Journal
+from plant_service.keeper import Keeper
+from plant_service.market import Marketplace
+from plant_service.pot import Care, Pot
+from plant_service.settings import PlantSettings
+from plant_service.shelf import Shelf
+from plant_service.station import Meter, Station, TapDocument
+
+Loop = Callable[[], Awaitable[None]]
+
+
+def build(
+    settings: PlantSettings,
+    clock: Clock,
+    opener: Opener,
+    transport: PeerTransport | httpx.AsyncBaseTransport,
+    rng: Random,
+    *,
+    identity: Identity | None = None,
+    verifier: Verifier | None = None,
+    peers: Peers | None = None,
+    open_reads: bool = True,
+    disk: Disk | None = None,
+) -> Node:
+    """The node `settings` describe. Call inside the loop; raises StorageError, ConfigError.
+
+    The data folder belongs to the node from here on, until its loops are cancelled. `verifier` None switches
+    authentication off (tests). Nothing here is left to chance: `rng` is there for the shape all services share.
+    """
+    journal = Journal(settings.id, settings.folder / "history.sqlite3", clock)
+    maker = build_pot if settings.kind == "pot" else build_station
+    mesh = Mesh(transport, identity, clock)
+    return maker(_Parts(settings, clock, opener, mesh, verifier, peers or Peers(), journal, open_reads, disk))
+
+
+class _Parts:
+    """What both kinds are made from."""
+
+    def __init__(
+        self,
+        settings: PlantSettings,
+        clock: Clock,
+        opener: Opener,
+        mesh: Mesh,
+        verifier: Verifier | None,
+        peers: Peers,
+        journal: Journal,
+        open_reads: bool,
+        disk: Disk | None,
+    ) -> None:
+        self.settings, self.clock, self.opener, self.mesh = settings, clock, opener, mesh
+        self.verifier, self.peers, self.journal, self.open_reads, self.disk = verifier, peers, journal, open_reads, disk
+
+    def file(self, name: str) -> DurableDocument:
+        return DurableDocument(self.settings.folder / f"{name}.json", f"{name}/1", self.clock, self.disk)
+
+    def docks(self, dock_ids: list[str]) -> Keeper[Docks, DocksDocument]:
+        owner, clock = self.settings.id, self.clock
+        return Keeper(self.file("docks"), DocksDocument, lambda doc: Docks(owner, dock_ids, doc, clock.now()))
+
+
+def build_pot(parts: _Parts) -> Node:
+    settings, clock, journal = parts.settings, parts.clock, parts.journal
+    limits = Limits()
+    card, base = settings.card(), settings.care()
+    market = Keeper(parts.file("market"), MarketDocument, lambda doc: Market(card, doc, clock.now(), limits=limits))
+    fruits = Keeper(parts.file("inventory"), InventoryDocument, lambda doc: Fruits(settings.id, doc))
+    care = Keeper(parts.file("settings"), SettingsPatch, lambda doc: Care(base, doc))
+    docks = parts.docks([settings.id])
+    probe = open_probe(settings.probe_url, parts.opener, clock)
+    place = Marketplace(market, parts.mesh, parts.peers, clock, journal)
+    pot = Pot(settings, clock, probe, place, docks, Shelf(fruits, clock), care, journal)
+    keepers = (market, fruits, care, docks)
+    _tell_alarms(keepers, journal)
+    app = create_app(
+        card=pot.card, clock=clock, verifier=parts.verifier, ready=pot.ready, events=journal.events,
+        open_reads=parts.open_reads,
+    )  # fmt: skip
+    api.add_pot(app, pot)
+    return Node(settings.id, "plant", app, (probe.run, pot.watch, _closing(place.run, keepers), journal.run))
+
+
+def build_station(parts: _Parts) -> Node:
+    settings, clock, journal = parts.settings, parts.clock, parts.journal
+    valve = open_valve(settings.tap_url, parts.opener, clock) if settings.tap_url else None
+    docks = parts.docks([dock.id for dock in settings.docks])
+    meter = Keeper(parts.file("tap"), TapDocument, Meter)
+    station = Station(settings, clock, valve, docks, meter, journal)
+    keepers = (docks, meter)
+    _tell_alarms(keepers, journal)
+    app = create_app(
+        card=station.card, clock=clock, verifier=parts.verifier, ready=station.ready, events=journal.events,
+        open_reads=parts.open_reads,
+    )  # fmt: skip
+    api.add_station(app, station)
+    loops: list[Loop] = [_closing(journal.run, keepers)]
+    if valve is not None:
+        loops.append(valve.run)
+    return Node(settings.id, "station", app, tuple(loops))
+
+
+def _tell_alarms(keepers: tuple[Keeper, ...], journal: Journal) -> None:  # type: ignore[type-arg]
+    for keeper in keepers:
+        for alarm in keeper.alarms:
+            journal.alarm(alarm)
+
+
+def _closing(loop: Loop, keepers: tuple[Keeper, ...]) -> Loop:  # type: ignore[type-arg]
+    """The loop, after which the documents are free for another writer."""
+
+    async def run() -> None:
+        try:
+            await loop()
+        finally:
+            for keeper in keepers:
+                keeper.close()
+
+    return run
