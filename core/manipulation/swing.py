@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 from core.errors import Refused
 from core.manipulation.arm import Joints, limit_broken, plane_points
@@ -54,7 +55,7 @@ def obstruction(q: Joints, soil_height_m: float = SOIL_HEIGHT_M) -> str:
     """
     cos, sin = math.cos(q[0]), math.sin(q[0])
     points = plane_points(q)
-    for (ra, za), (rb, zb) in zip(points[1:-1], points[2:], strict=True):
+    for (ra, za), (rb, zb) in pairwise(points[1:]):
         for share in (0.0, 0.25, 0.5, 0.75, 1.0):
             r, z = ra + share * (rb - ra), za + share * (zb - za)
             x, y = SHOULDER_X_M + r * cos, r * sin

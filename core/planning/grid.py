@@ -43,7 +43,8 @@ class GridMap:
 
     def contains(self, x_m: float, y_m: float) -> bool:
         rows, columns = self.occupied.shape
-        return 0 <= x_m - self.x0_m < columns * self.cell_m and 0 <= y_m - self.y0_m < rows * self.cell_m
+        inside_x = 0 <= x_m - self.x0_m < int(columns) * self.cell_m
+        return inside_x and 0 <= y_m - self.y0_m < int(rows) * self.cell_m
 
     def add_disc(self, x_m: float, y_m: float, radius_m: float) -> None:
         """A pot, or another robot."""

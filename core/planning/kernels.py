@@ -21,7 +21,7 @@ Ints = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def plain_field(dist: Ints, width: int, goal: int) -> None:
     """Fill `dist` (flat, FAR where free, -1 where blocked) with the cost from every cell to `goal`; all cells weigh 1."""
     size = dist.size
@@ -62,7 +62,7 @@ def plain_field(dist: Ints, width: int, goal: int) -> None:
         level += 1
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def weighted_field(dist: Ints, weight: Bytes, width: int, goal: int) -> None:
     """The same where entering a cell costs `weight` (1 .. WEIGHT_MAX) times the step."""
     size = dist.size
@@ -99,7 +99,7 @@ def weighted_field(dist: Ints, weight: Bytes, width: int, goal: int) -> None:
         level += 1
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def descend(dist: Ints, width: int, start: int) -> Ints:
     """Cells from `start` down the field to its goal. `start` must be reached."""
     steps = (-1, 1, -width, width, -width - 1, -width + 1, width - 1, width + 1)
@@ -125,7 +125,7 @@ def descend(dist: Ints, width: int, start: int) -> Ints:
         c = c + steps[best]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def line_cost(dist: Ints, weight: Bytes, width: int, a: int, b: int) -> float:
     """Cost of the straight line between two cells in the field's unit; infinite when it meets a blocked cell."""
     ra, ca = a // width, a % width
@@ -141,10 +141,11 @@ def line_cost(dist: Ints, weight: Bytes, width: int, a: int, b: int) -> float:
         if dist[k] < 0:
             return np.inf
         total += weight[k]
-    return STRAIGHT * np.sqrt(float(dr * dr + dc * dc)) * total / (n + 1)
+    cost: float = STRAIGHT * np.sqrt(float(dr * dr + dc * dc)) * total / (n + 1)
+    return cost
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def shortcut(dist: Ints, weight: Bytes, width: int, path: Ints) -> Ints:
     """Keep only the cells where the path must turn: a straight line replaces what it does not make dearer."""
     kept = np.empty(path.size, np.int32)

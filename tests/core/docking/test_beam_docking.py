@@ -44,7 +44,7 @@ class Plane:
         touching = x >= 0.0
         self.bump_left = self.bump_right = touching and command.v_mps > 0.0
         self.pose = (min(x, 0.0), y, yaw)
-        self.docked = -0.015 <= self.pose[0] and abs(y) <= 0.02 and abs(yaw) <= math.radians(6)
+        self.docked = self.pose[0] >= -0.015 and abs(y) <= 0.02 and abs(yaw) <= math.radians(6)
         self._see()
 
     def _see(self) -> None:
