@@ -155,10 +155,13 @@ class FirmataEmulator:
 
 
 def _capabilities(pin: int) -> list[tuple[int, int]]:
-    """(mode, resolution in bits) of an Uno's pin; the serial port's own pins have none."""
+    """(mode, resolution in bits) of an Uno's pin; the serial port's own pins have none.
+
+    The protocol leaves the order open; clients of the pyFirmata family look for output right after input.
+    """
     if pin < 2:
         return []
-    modes = [(wire.MODE_INPUT, 1), (wire.MODE_PULLUP, 1), (wire.MODE_OUTPUT, 1)]
+    modes = [(wire.MODE_INPUT, 1), (wire.MODE_OUTPUT, 1), (wire.MODE_PULLUP, 1)]
     if pin >= DIGITAL_PINS:
         return [*modes, (wire.MODE_ANALOG, 10)]
     return modes + ([(wire.MODE_PWM, 8)] if pin in PWM_PINS else []) + [(wire.MODE_SERVO, 14)]
