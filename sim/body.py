@@ -77,7 +77,8 @@ class RobotBody:
     def after(self, docks: list[beams.Dock]) -> None:
         """Where are we, and does a dock hold us?"""
         self.pose = self._pose()
-        self.docked_at = next((dock.name for dock in docks if dock.mated(self.pose)), None)
+        held = self.docked_at
+        self.docked_at = next((dock.name for dock in docks if dock.mated(self.pose, dock.name == held)), None)
 
     def live(self, seconds: float) -> None:
         """The battery's side of time."""

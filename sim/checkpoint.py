@@ -54,6 +54,7 @@ def put_back(world: World, snapshot: dict[str, Any]) -> None:
     mujoco.mj_setState(world.model, world.data, np.array(snapshot["physics"]), PHYSICS)
     world.time_s, world.spilt_ml, world.tap_ml = (float(snapshot[k]) for k in ("time_s", "spilt_ml", "tap_ml"))
     world.tap_board.open = set(snapshot["taps"])
+    world.touch.forget()
     for name, robot in world.robots.items():
         _put_robot(robot, snapshot["robots"][name])
         world.touch.tally[name] = Tally(**snapshot["robots"][name]["tally"])

@@ -22,9 +22,11 @@ RED_ON_LEFT = g.DOCK_RED_SIDE == "left"
 MATED_ALONG_M = 0.015
 MATED_ACROSS_M = 0.020
 MATED_RAD = math.radians(6.0)
+HELD_SLACK = 1.2
 
-WALL_RANGE_M = 0.06
-"""Beyond the body's right-hand edge."""
+WALL_EYE_M = (0.10, -0.142)
+"""In the base frame, at the body's edge."""
+WALL_RANGE_M = 0.10
 
 Disc = tuple[float, float, float]
 """x, y, radius [m]."""
@@ -46,11 +48,12 @@ class Dock:
         self.emitter = self.docked.point(g.BODY_RADIUS_M + EMITTER_SETBACK_M, 0.0)
         self._out_rad = docked.yaw_rad + math.pi
 
-    def mated(self, pose: Planar) -> bool:
-        """Do the robot's plates touch the dock's?"""
+    def mated(self, pose: Planar, held: bool = False) -> bool:
+        """Do the robot's plates touch the dock's? Sprung plates that already do (`held`) part a little later."""
         along, across = self.docked.local(pose.x_m, pose.y_m)
-        near = abs(along) <= MATED_ALONG_M and abs(across) <= MATED_ACROSS_M and abs(pose.z_m) < 0.02
-        return near and abs(wrap(pose.yaw_rad - self.docked.yaw_rad)) <= MATED_RAD
+        slack = HELD_SLACK if held else 1.0
+        near = abs(along) <= slack * MATED_ALONG_M and abs(across) <= slack * MATED_ACROSS_M and abs(pose.z_m) < 0.02
+        return near and abs(wrap(pose.yaw_rad - self.docked.yaw_rad)) <= slack * MATED_RAD
 
     def shines_on(self, x_m: float, y_m: float, discs: Iterable[Disc]) -> Infrared:
         """What of this dock a receiver at (x, y) sees past the discs that stand about."""
@@ -84,7 +87,7 @@ def infrared(docks: Iterable[Dock], pose: Planar, discs: list[Disc]) -> Infrared
 
 def wall(pose: Planar, discs: list[Disc]) -> bool:
     """The wall sensor looks to the right from the front right of the body."""
-    x_m, y_m = pose.point(0.10, -0.142)
+    x_m, y_m = pose.point(*WALL_EYE_M)
     ahead = pose.yaw_rad - math.pi / 2
     dx, dy = WALL_RANGE_M * math.cos(ahead), WALL_RANGE_M * math.sin(ahead)
     return any(_cuts(x_m, y_m, dx, dy, disc) for disc in discs)

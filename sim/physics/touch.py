@@ -62,6 +62,10 @@ class Touch:
         self._watched = np.array([kind in ("shell", "arm") for kind, _ in self._owner])
         self._force = np.zeros(6)
 
+    def forget(self) -> None:
+        """Time has jumped: what touches now touches for the first time."""
+        self._last.clear()
+
     def look(self, now_s: float, poses: dict[str, Planar], mated: dict[str, str | None]) -> None:
         """Updates `pressed` and `tally`. A mated robot does not feel its own dock: the plates carry it."""
         for press in self.pressed.values():

@@ -16,7 +16,7 @@ import mujoco
 from core.robots import gardener as g
 from core.scenario import Robot
 
-TYRE_STIFFNESS_N = 115.0
+TYRE_STIFFNESS_N = 90.0
 """Force per unit of slip ratio, one tyre. Chosen so that an 85 cm square by odometry ends 5-15 % of its length off."""
 REAR_STIFFNESS_N = 14.0
 """Side force of the rear caster per radian of slip angle: it trails and swings round, late."""

@@ -107,7 +107,7 @@ def add_station_dock(spec: Any, name: str, dock: StationDock) -> None:
     yaw_rad = math.radians(dock.dock_yaw_deg)
     foot = [dock.x_m - 0.08 * math.cos(yaw_rad), dock.y_m - 0.08 * math.sin(yaw_rad)]
     spout = [dock.dock.x_m, dock.dock.y_m]
-    for part, a, b in (("stand", [*foot, 0.0], [*foot, 0.52]), ("spout", [*foot, 0.52], [*spout, 0.50])):
+    for part, a, b in (("stand", [*foot, 0.0], [*foot, 0.62]), ("spout", [*foot, 0.62], [*spout, 0.60])):
         spec.worldbody.add_geom(name=f"{name}/{part}", type=CAPSULE, size=[0.012, 0, 0], fromto=[*a, *b], rgba=METAL_RGBA,
                                 group=VISUAL_GROUP, **NOTHING)  # fmt: skip
 

@@ -186,6 +186,8 @@ def _hand(spec: Any, hand: Any, name: str) -> None:
     hand.add_site(name=f"{name}/nozzle", pos=list(g.NOZZLE_IN_HAND_M), group=SITE_GROUP)
     _limb(hand, f"{name}/hose", [0.02, 0, -0.018], list(g.NOZZLE_IN_HAND_M), 0.004)
     hand.add_camera(name=f"{name}/eye", pos=list(g.CAMERA_IN_HAND_M), quat=[0.5, 0.5, -0.5, -0.5], fovy=48.0)
+    hand.add_geom(name=f"{name}/bracket", type=BOX, size=[0.006, 0.012, 0.016], pos=[0.012, 0, 0.024], rgba=DARK, mass=0.0,
+                  group=VISUAL_GROUP, **NOTHING)  # fmt: skip
     hand.add_geom(name=f"{name}/camera", type=BOX, size=[0.012, 0.018, 0.014], rgba=DARK, mass=0.0, group=VISUAL_GROUP,
                   pos=[g.CAMERA_IN_HAND_M[0] - 0.014, g.CAMERA_IN_HAND_M[1], g.CAMERA_IN_HAND_M[2]],
                   **NOTHING)  # fmt: skip
