@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import random
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -216,9 +216,14 @@ class Garden:
         self.soils.setdefault("station", self.soil("station", 0.2))
         return self._start(
             PlantSettings(
-                id="station", kind="station", url="http://station", data=self.folder / "station", docks=docks,
-                tap_url="memory://station?valve=8", **more,
-            )  # fmt: skip
+                id="station",
+                kind="station",
+                url="http://station",
+                data=self.folder / "station",
+                docks=docks,
+                tap_url="memory://station?valve=8",
+                **more,
+            )
         )
 
     def _start(self, settings: PlantSettings) -> Node:
@@ -308,7 +313,7 @@ Story = Callable[[Garden], Coroutine[Any, Any, None]]
 
 
 @pytest.fixture
-def play(tmp_path: Path) -> Iterator[Callable[[Story], None]]:
+def play(tmp_path: Path) -> Callable[[Story], None]:
     """Run a story in a fresh garden on virtual time."""
 
     def run(story: Story) -> None:
@@ -321,4 +326,4 @@ def play(tmp_path: Path) -> Iterator[Callable[[Story], None]]:
 
         run_virtual(main())
 
-    yield run
+    return run

@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import asyncio
+import errno
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.clock import VirtualClock
+from core.errors import StorageError
+from core.store import DurableDocument, pack
+from core.virtual import run_virtual
+
+Disks = dict[str, Any]
+
+
+def open_file(folder: Path, disk: Any = None) -> DurableDocument:
+    return DurableDocument(folder / "doc.json", "test/1", VirtualClock(), disk)
+
+
+def reopen(file: DurableDocument) -> Any:
+    file.close()
+    again = open_file(file.path.parent)
+    try:
+        return again.load()
+    finally:
+        again.close()
+
+
+def test_what_was_saved_is_loaded_again(tmp_path: Path) -> None:
+    file = open_file(tmp_path)
+    assert file.load() is None
+    assert file.commit({"a": [1, 2.5, "ü"]}) == 1
+    assert file.commit(b'{"a":2}') == 2
+    assert reopen(file) == {"a": 2}
+
+
+def test_the_file_is_readable_json_with_its_generation(tmp_path: Path) -> None:
+    file = open_file(tmp_path)
+    file.load()
+    file.commit({"a": 1})
+    envelope = json.loads(file.path.read_bytes())
+    assert (envelope["schema"], envelope["generation"], envelope["doc"]) == ("test/1", 1, {"a": 1})
+    file.close()
+
+
+def test_two_writers_are_refused(tmp_path: Path) -> None:
+    first, second = open_file(tmp_path), open_file(tmp_path)
+    first.load()
+    with pytest.raises(StorageError, match="another writer"):
+        second.load()
+    first.close()
+    assert second.load() is None
+    second.close()
+
+
+def test_a_closed_file_takes_nothing(tmp_path: Path) -> None:
+    file = open_file(tmp_path)
+    file.load()
+    file.close()
+    with pytest.raises(StorageError, match="closed"):
+        file.commit({"a": 1})
+
+
+def test_concurrent_saves_share_commits_and_each_is_durable_when_answered(tmp_path: Path) -> None:
+    async def main() -> tuple[list[int], int]:
+        file = open_file(tmp_path)
+        file.load()
+        generations = await asyncio.gather(*(file.save({"n": n}) for n in range(50)))
+        file.close()
+        return generations, file.generation
+
+    generations, last = run_virtual(main())
+    assert last == 1
+    assert generations == [1] * 50
+    file = open_file(tmp_path)
+    assert file.load() == {"n": 49}
+    file.close()
+
+
+def test_any_damaged_byte_is_noticed_and_the_older_copy_used(tmp_path: Path) -> None:
+    seed = 2026
+    print("seed", seed)
+    rng = random.Random(seed)
+    good, older = pack("test/1", 2, b'{"n":2}'), pack("test/1", 1, b'{"n":1}')
+    for round_ in range(1000):
+        folder = tmp_path / str(round_ % 7)
+        folder.mkdir(exist_ok=True)
+        damaged = _damage(good, rng)
+        (folder / "doc.json").write_bytes(damaged)
+        (folder / "doc.json.1").write_bytes(older)
+        file = open_file(folder)
+        assert file.load() == {"n": 1}, damaged
+        assert file.alarms
+        assert sorted(folder.glob("doc.json.bad-*"))[-1].exists()
+        file.close()
+        for left in folder.iterdir():
+            left.unlink()
+
+
+def _damage(data: bytes, rng: random.Random) -> bytes:
+    how, at = rng.randrange(4), rng.randrange(len(data))
+    if how == 0:
+        return data[:at]
+    if how == 1:
+        return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
+    if how == 2:
+        return data[:at] + b"\0" * (len(data) - at)
+    return data + rng.randbytes(rng.randrange(1, 5))
+
+
+def test_after_the_older_copy_was_used_a_crash_still_leaves_one(tmp_path: Path, disks: Disks) -> None:
+    older = pack("test/1", 1, b'{"n":1}')
+    for stop in range(24):
+        disk = disks["sim"]({"doc.json.1": older}, 10_000)
+        file = open_file(tmp_path, disk)
+        assert file.load() == {"n": 1}
+        disk.steps, disk.stop_after = 0, stop
+        acknowledged = _commit_until_cut(file, disks)
+        files = disk.after_power_cut(random.Random(stop))
+        again = open_file(tmp_path, disks["sim"](files, 10_000))
+        assert again.load() in ([{"n": 2}] if acknowledged else [{"n": 1}, {"n": 2}])
+        again.close()
+
+
+def _commit_until_cut(file: DurableDocument, disks: Disks) -> bool:
+    try:
+        file.commit({"n": 2})
+        return True
+    except disks["cut"]:
+        return False
+    finally:
+        file.close()
+
+
+@pytest.mark.parametrize("has_older", [False, True])
+def test_every_crash_point_recovers_to_the_old_or_the_new_document(tmp_path: Path, disks: Disks, has_older: bool) -> None:
+    files = {"doc.json": pack("test/1", 7, b'{"n":1}')}
+    if has_older:
+        files["doc.json.1"] = pack("test/1", 6, b'{"n":0}')
+    seen = set()
+    for stop in range(24):
+        for seed in range(80):
+            disk = disks["sim"](files, stop)
+            file = open_file(tmp_path, disk)
+            file.load()
+            acknowledged = _commit_until_cut(file, disks)
+            again = open_file(tmp_path, disks["sim"](disk.after_power_cut(random.Random(seed)), 10_000))
+            found = again.load()
+            again.close()
+            assert found in ([{"n": 2}] if acknowledged else [{"n": 1}, {"n": 2}]), (stop, seed)
+            seen.add((acknowledged, found["n"]))
+    assert seen == {(False, 1), (False, 2), (True, 2)}
+
+
+def test_the_first_document_ever_is_there_once_acknowledged(tmp_path: Path, disks: Disks) -> None:
+    for stop in range(24):
+        for seed in range(50):
+            disk = disks["sim"]({}, stop)
+            file = open_file(tmp_path, disk)
+            assert file.load() is None
+            acknowledged = _commit_until_cut(file, disks)
+            again = open_file(tmp_path, disks["sim"](disk.after_power_cut(random.Random(seed)), 10_000))
+            assert again.load() in ([{"n": 2}] if acknowledged else [None, {"n": 2}]), (stop, seed)
+            again.close()
+
+
+@pytest.mark.parametrize("method", ["create", "write", "link", "rename", "unlink"])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+def test_a_failed_write_is_said_and_the_next_one_may_succeed(tmp_path: Path, disks: Disks, method: str, code: int) -> None:
+    file = open_file(tmp_path)
+    file.load()
+    file.commit({"n": 1})
+    file.commit({"n": 2})
+    file._disk = disks["failing"](method, code)
+    with pytest.raises(StorageError) as raised:
+        file.commit({"n": 3})
+    assert raised.value.status == 507
+    assert not file.broken
+    assert file.commit({"n": 4}) == 3
+    assert reopen(file) == {"n": 4}
+
+
+@pytest.mark.parametrize("method", ["fsync", "fsync_dir"])
+def test_after_a_failed_fsync_nothing_is_acknowledged_any_more(tmp_path: Path, disks: Disks, method: str) -> None:
+    async def main() -> None:
+        file = open_file(tmp_path, disks["failing"](method, errno.EIO))
+        file.load()
+        for n in range(3):
+            with pytest.raises(StorageError):
+                await file.save({"n": n})
+        assert "fsync" in file.broken
+        file.close()
+
+    run_virtual(main())
+
+
+def test_saves_queued_behind_a_failed_commit_fail_with_it(tmp_path: Path, disks: Disks) -> None:
+    async def main() -> None:
+        file = open_file(tmp_path, disks["failing"]("rename", errno.ENOSPC))
+        file.load()
+        answers = await asyncio.gather(*(file.save({"n": n}) for n in range(5)), return_exceptions=True)
+        assert all(isinstance(answer, StorageError) for answer in answers)
+        assert await file.save({"n": 9}) == 1
+        file.close()
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("code", [errno.EMFILE, errno.EACCES, errno.EIO])
+def test_only_enoent_means_absent(tmp_path: Path, disks: Disks, code: int) -> None:
+    first = open_file(tmp_path)
+    first.load()
+    first.commit({"n": 1})
+    first.close()
+    file = open_file(tmp_path, disks["failing"]("read", code))
+    with pytest.raises(StorageError, match="cannot read"):
+        file.load()
+    assert reopen(file) == {"n": 1}
+
+
+def test_two_damaged_copies_refuse_to_start_and_stay_where_they_are(tmp_path: Path) -> None:
+    for name in ("doc.json", "doc.json.1"):
+        (tmp_path / name).write_bytes(b"{}")
+    file = open_file(tmp_path)
+    with pytest.raises(StorageError, match="damaged"):
+        file.load()
+    assert {path.name for path in tmp_path.glob("doc.json*")} >= {"doc.json", "doc.json.1"}
+    file.close()
+
+
+def test_another_programs_document_is_not_taken_for_ours(tmp_path: Path) -> None:
+    (tmp_path / "doc.json").write_bytes(pack("other/1", 1, b"{}"))
+    file = open_file(tmp_path)
+    with pytest.raises(StorageError, match="other/1"):
+        file.load()
+    file.close()
