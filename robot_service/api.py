@@ -1,0 +1,110 @@
+"""A robot's HTTP: bids, its queue, its state, an operator's jobs, the e-stop."""
+
+from __future__ import annotations
+
+import csv
+import io
+from typing import Annotated
+
+from fastapi import FastAPI, Query, Response
+
+from core.mesh.auth import ROLES, Caller, Verifier
+from core.mesh.chassis import allow, body, create_app
+from core.wire.documents import HistoryEntry
+from core.wire.market import Announcement, Award, Bid
+from core.wire.robot import Job, JobRequest, Position, QueuedTask, RobotState, Stopped, StopRequest
+from robot_service.brain import Brain, queued
+
+
+def make_app(brain: Brain, verifier: Verifier | None, open_reads: bool = True) -> FastAPI:
+    app = create_app(
+        card=brain.card,
+        clock=brain.clock,
+        verifier=verifier,
+        ready=brain.missing,
+        events=brain.events,
+        open_reads=open_reads,
+    )
+    _market(app, brain)
+    _readings(app, brain)
+    _jobs(app, brain)
+    _emergency(app, brain)
+    return app
+
+
+def _market(app: FastAPI, brain: Brain) -> None:
+    @app.post("/bids", summary="Announcement in, bid out", tags=["market"])
+    async def bid(asked: Announcement = body(Announcement), caller: Caller = allow("plant", "operator")) -> Bid:
+        return await brain.bid(asked)
+
+    @app.get("/tasks", summary="The queue", tags=["market"])
+    async def tasks() -> list[QueuedTask]:
+        return [queued(entry) for entry in brain.queue.entries if entry.kind != "job"]
+
+    @app.post("/tasks", summary="Award", tags=["market"], status_code=201)
+    async def award(award: Award = body(Award), caller: Caller = allow("plant", "operator")) -> QueuedTask:
+        return brain.award(award, caller)
+
+    @app.get("/tasks/{task_id:path}", summary="One task of the queue", tags=["market"])
+    async def task(task_id: str) -> QueuedTask:
+        return queued(brain.queue.get(task_id))
+
+    @app.delete("/tasks/{task_id:path}", summary="Kill task", tags=["market"])
+    async def kill(task_id: str, caller: Caller = allow("plant", "operator")) -> QueuedTask:
+        return brain.kill(task_id, caller)
+
+
+def _readings(app: FastAPI, brain: Brain) -> None:
+    @app.get("/state", summary="Pose, battery, water, job", tags=["robot"])
+    async def state() -> RobotState:
+        return brain.state()
+
+    @app.get("/position", summary="Cheap, for neighbours", tags=["robot"])
+    async def position() -> Position:
+        return brain.position()
+
+    @app.get("/history", summary="What happened and why", tags=["robot"], response_model=list[HistoryEntry])
+    async def history(
+        after: Annotated[int, Query(ge=0, le=2**53)] = 0,
+        format: Annotated[str, Query(pattern="^(json|csv)$")] = "json",
+    ) -> object:
+        entries = brain.events.since(after)
+        return _csv(entries) if format == "csv" else entries
+
+
+def _csv(entries: list[HistoryEntry]) -> Response:
+    out = io.StringIO()
+    rows = csv.writer(out)
+    rows.writerow(["id", "t_s", "kind", "what", "task_id"])
+    rows.writerows([e.id, f"{e.t_s:.3f}", e.kind, e.what, e.task_id] for e in entries)
+    return Response(out.getvalue(), media_type="text/csv")
+
+
+def _jobs(app: FastAPI, brain: Brain) -> None:
+    @app.post("/jobs", summary="A job from a supervisor", tags=["operator"], status_code=202)
+    async def post_job(response: Response, wish: JobRequest = body(JobRequest), caller: Caller = allow("operator")) -> Job:
+        job = brain.add_job(wish)
+        response.headers["location"] = f"/jobs/{job.job_id}"
+        return job
+
+    @app.get("/jobs", summary="Recent jobs", tags=["operator"])
+    async def jobs() -> list[Job]:
+        return brain.reporter.all_jobs()
+
+    @app.get("/jobs/{job_id:path}", summary="How a job stands", tags=["operator"])
+    async def get_job(job_id: str) -> Job:
+        return brain.reporter.job(job_id)
+
+    @app.delete("/jobs/{job_id:path}", summary="Call a job off", tags=["operator"])
+    async def delete_job(job_id: str, caller: Caller = allow("operator")) -> Job:
+        return brain.call_off(job_id, caller)
+
+
+def _emergency(app: FastAPI, brain: Brain) -> None:
+    @app.post("/stop", summary="E-stop: latches", tags=["safety"])
+    async def stop(wish: StopRequest = body(StopRequest), caller: Caller = allow(*ROLES)) -> Stopped:
+        return await brain.stop(caller, wish.reason)
+
+    @app.post("/resume", summary="Release the e-stop", tags=["safety"])
+    async def resume(caller: Caller = allow("operator")) -> Stopped:
+        return await brain.resume(caller)

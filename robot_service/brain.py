@@ -1,0 +1,337 @@
+"""A robot's brain, put together: `build` makes the node that a process, or the lab, runs."""
+
+from __future__ import annotations
+
+import random
+
+import httpx
+
+from core.allocation.bidding import Condition, Stop, price, work_s
+from core.allocation.queue import Entry, TaskQueue
+from core.clock import Clock
+from core.errors import Forbidden, Unavailable, Unprocessable
+from core.mesh.auth import Caller, Identity, Verifier
+from core.mesh.client import Mesh, PeerTransport
+from core.mesh.events import EventLog
+from core.mesh.node import Node
+from core.mesh.peers import Peers
+from core.robots import gardener
+from core.robots.markers import ceiling_markers
+from core.wire.body import BodyState
+from core.wire.documents import NodeCard
+from core.wire.geometry import Point2, Pose2
+from core.wire.market import Announcement, Award, Bid
+from core.wire.robot import Job, JobRequest, Position, QueuedTask, RobotState, Stopped
+from hw.links import Opener
+from robot_service.bodylink import BodyLink
+from robot_service.docks import Docks
+from robot_service.ground import Ground
+from robot_service.localisation import Localisation
+from robot_service.neighbours import Neighbours
+from robot_service.planner import Planner
+from robot_service.reporter import Reporter
+from robot_service.robot import Robot, launch_of
+from robot_service.scheduler import Scheduler
+from robot_service.settings import RobotSettings
+
+TURNING_S = 3.0
+STOP_ANSWER_S = 2.0
+DRIVE_RATIO = 1.15
+"""Driven time over length / cruise: corners and braking."""
+
+
+class Brain:
+    """Everything one robot is, but for HTTP."""
+
+    def __init__(
+        self,
+        settings: RobotSettings,
+        clock: Clock,
+        opener: Opener,
+        mesh: Mesh,
+        peers: Peers,
+        rng: random.Random,
+    ) -> None:
+        self.settings, self.clock = settings, clock
+        self.body = BodyLink(settings.body_url, settings.secret(), opener, clock)
+        markers = ceiling_markers(settings.map.arena)
+        where = Localisation(settings.localisation, settings.wheelbase_m, markers, settings.map, clock)
+        self.events = EventLog(clock)
+        neighbours = Neighbours(settings.id, peers, mesh, clock, lambda: self.robot.moving, lambda: where.pose)
+        self.robot = Robot(
+            settings, clock, rng, self.body, where, Ground(settings.map), neighbours, mesh, peers, self.events
+        )
+        self.docks = Docks(settings.id, mesh, peers, clock)
+        self.queue = TaskQueue()
+        self.reporter = Reporter(self.robot, self.queue)
+        planner = Planner(self.robot, self.docks, self.travel_s)
+        self.scheduler = Scheduler(self.robot, self.docks, planner, self.queue, self.reporter)
+        self.reporter.kill = self.scheduler.kill
+        self._stopped = True
+        self._travels: dict[tuple[int, str, str], float | None] = {}
+        self._job_number = 0
+        self.body.listeners += [where.take, self.robot.watch, self._see]
+
+    # ------------------------------------------------------------------ readings
+    def _see(self, state: BodyState) -> None:
+        if state.stopped != self._stopped:
+            self._stopped = state.stopped
+            self.robot.note("stop", f"stopped by {state.stopped_by}" if state.stopped else "released")
+            if state.stopped:
+                self.scheduler.halt(f"stopped by {state.stopped_by or 'the e-stop'}")
+
+    def missing(self) -> list[str]:
+        """What keeps it from work, for `/readyz`."""
+        state = self.body.state
+        if self.body.down or state is None:
+            return [self.body.down or "the body is silent"]
+        return [*state.down, *([self.robot.where.lost] if self.robot.where.lost else [])]
+
+    def card(self) -> NodeCard:
+        pose = self.robot.where.pose
+        place = {} if pose is None else {"pose": _pose2(pose).model_dump()}
+        return NodeCard(
+            id=self.settings.id,
+            kind="robot",
+            capabilities=list(self.settings.capabilities),
+            place=place,
+            links={name: f"{self.settings.url}/{name}" for name in ("state", "position", "tasks", "history", "docs")},
+        )
+
+    def state(self) -> RobotState:
+        body, activity, where = self.body.state, self.robot.activity, self.robot.where
+        pose = where.pose
+        stopped = body is None or body.stopped
+        return RobotState(
+            robot_id=self.settings.id,
+            now_s=self.clock.now(),
+            pose=None if pose is None else _pose2(pose),
+            position_sigma_m=None if pose is None else where.sigma_m,
+            docked_at=where.docked_at,
+            battery_ratio=0.0 if body is None else min(1.0, max(0.0, body.battery_ratio)),
+            tank_ml=None if body is None or body.tank_ml is None else max(0.0, body.tank_ml),
+            job="stopped" if stopped and body is not None else activity.job,
+            waiting=activity.waiting,
+            stopped=stopped,
+            stopped_by="" if body is None else body.stopped_by,
+            down=[self.body.down] if self.body.down or body is None else list(body.down),
+            queue=[queued(entry) for entry in self.queue.entries if entry.kind != "job"],
+            route=[Point2(x_m=x, y_m=y) for x, y in activity.route],
+        )
+
+    def position(self) -> Position:
+        """Raises Unavailable until the robot knows where it is."""
+        pose, activity = self.robot.where.pose, self.robot.activity
+        if pose is None:
+            raise Unavailable(self.robot.where.lost or "does not know where it is", hint="ask again in a second")
+        return Position(
+            robot_id=self.settings.id,
+            pose=_pose2(pose),
+            radius_m=gardener.BODY_RADIUS_M,
+            v_mps=activity.v_mps,
+            moving=self.robot.moving,
+            docked_at=self.robot.where.docked_at,
+            route=[Point2(x_m=x, y_m=y) for x, y in activity.route],
+            rank=activity.rank,
+        )
+
+    # ------------------------------------------------------------------ the market
+    async def bid(self, asked: Announcement) -> Bid:
+        """Price a task. Wavefronts are computed once a dock and map, so that this is a lookup."""
+        await self.prepare()
+        if self.robot.peers.find(asked.plant.plant_id) is None:
+            return self._no(asked, f"{asked.plant.plant_id} is nobody we know")
+        if self.settings.map.dock(asked.plant.plant_id) is None:
+            return self._no(asked, f"the dock of {asked.plant.plant_id} is not on our map")
+        return price(asked, self.condition())
+
+    def _no(self, asked: Announcement, reason: str) -> Bid:
+        return Bid(task_id=asked.task_id, robot_id=self.settings.id, cost_s=None, reason=reason)
+
+    async def prepare(self) -> None:
+        """Have the field of every dock at hand."""
+        ground = self.robot.ground
+        for dock in self.settings.map.docks:
+            x_m, y_m, _ = launch_of(dock)
+            if not ground.knows((x_m, y_m)):
+                await self.clock.offload(lambda goal=(x_m, y_m): ground.field_to(goal), 0.003)  # type: ignore[misc]
+
+    def travel_s(self, place: str, dock: str) -> float | None:
+        """Seconds from a dock's launch point, or from here, to another's; None when there is no way."""
+        goal = launch_of(self.robot.dock(dock))
+        here = place == "here" or self.settings.map.dock(place) is None
+        key = (self.robot.ground.version, place, dock)
+        if not here and key in self._travels:
+            return self._travels[key]
+        start = self.robot.where.pose if here else launch_of(self.robot.dock(place))
+        length_m = None if start is None else self.robot.ground.length_m(start, (goal[0], goal[1]))
+        time_s = None if length_m is None else length_m / gardener.CRUISE_MPS * DRIVE_RATIO + TURNING_S
+        if not here:
+            self._travels = {k: v for k, v in self._travels.items() if k[0] == key[0]} | {key: time_s}
+        return time_s
+
+    def condition(self) -> Condition:
+        body, where = self.body.state, self.robot.where
+        head = self.queue.next()
+        running = head if head is not None and head.running else None
+        docks = self.settings.map.docks
+        return Condition(
+            robot_id=self.settings.id,
+            can=frozenset(self.settings.capabilities),
+            travel=self.travel_s,
+            stopped_by=(body.stopped_by if body is not None and body.stopped else None),
+            down=(self.body.down,) if self.body.down else tuple(body.down if body is not None else ("body",)),
+            lost=where.lost,
+            battery_ratio=0.0 if body is None else body.battery_ratio,
+            tank_ml=None if body is None else body.tank_ml,
+            docked_at=where.docked_at,
+            current_s=self._rest_s(running),
+            current=None if running is None else self._stop(running),
+            queue=tuple(self._stop(entry) for entry in self.queue.entries if not entry.running),
+            taps=tuple(dock.name for dock in docks if dock.tap),
+            chargers=tuple(dock.name for dock in docks),
+        )
+
+    def _stop(self, entry: Entry) -> Stop:
+        dose_ml = entry.announcement.dose_ml if entry.announcement is not None else 0.0
+        own = entry.announcement is None
+        dock = self.robot.where.docked_at if own else entry.plant_id
+        return Stop(
+            dock=dock,
+            work_s=30.0 if own else work_s(entry.kind, dose_ml),  # type: ignore[arg-type]
+            dose_ml=dose_ml,
+            task_id=entry.task_id,
+            charge=entry.kind == "charge",
+            refill=entry.kind == "refill",
+        )
+
+    def _rest_s(self, running: Entry | None) -> float:
+        """Seconds the running task still needs: its usual length less what is spent of it."""
+        if running is None:
+            return 0.0
+        spent_s = self.clock.now() - self.scheduler.began_s
+        whole_s = 60.0 + (running.announcement.dose_ml / gardener.PUMP_MLPS if running.announcement is not None else 60.0)
+        return max(5.0, whole_s - spent_s)
+
+    def award(self, award: Award, caller: Caller) -> QueuedTask:
+        """Take a task; raises Forbidden for another plant's, Refused for a stale epoch."""
+        plant_id = award.announcement.plant.plant_id
+        if caller.role == "plant" and caller.subject != plant_id:
+            raise Forbidden(f"{caller.subject} cannot award a task of {plant_id}")
+        if self.robot.peers.find(plant_id) is None or self.settings.map.dock(plant_id) is None:
+            raise Unprocessable(f"{plant_id} is not a plant we know")
+        if award.announcement.kind not in self.settings.capabilities:
+            raise Unprocessable(f"cannot {award.announcement.kind}")
+        entry = self.queue.award(award, self.clock.now())
+        self.robot.note("award", f"{entry.kind} for {plant_id}", task_id=entry.task_id, epoch=entry.epoch)
+        self.scheduler.changed()
+        self.reporter.soon()
+        return queued(entry)
+
+    def kill(self, task_id: str, caller: Caller) -> QueuedTask:
+        """Kill task; a plant only its own."""
+        entry = self.queue.get(task_id)
+        if caller.role == "plant" and caller.subject != entry.plant_id:
+            raise Forbidden(f"{task_id} is a task of {entry.plant_id or self.settings.id}")
+        self.scheduler.kill(entry, f"killed by {caller.subject}")
+        return queued(entry)
+
+    # ------------------------------------------------------------------ the operator
+    def add_job(self, wish: JobRequest) -> Job:
+        """Queue a direct job; raises Unprocessable for one that makes no sense here."""
+        if wish.kind == "dock" and self.settings.map.dock(wish.at) is None:
+            known = ", ".join(dock.name for dock in self.settings.map.docks)
+            raise Unprocessable(f"no dock {wish.at!r}", hint=f"one of: {known}")
+        if wish.kind == "goto" and (wish.x_m is None or wish.y_m is None):
+            raise Unprocessable("goto needs x_m and y_m")
+        if wish.kind == "goto" and not self.robot.ground.fixed().is_free(wish.x_m or 0.0, wish.y_m or 0.0):
+            raise Unprocessable("the robot cannot stand there", hint="GET / tells the arena; keep off pots and edges")
+        self._job_number += 1
+        job = Job(
+            job_id=f"{self.settings.id}:job:{int(self.clock.now())}:{self._job_number}", kind=wish.kind, state="queued"
+        )
+        self.queue.push(Entry(task_id=job.job_id, kind="job", job=wish), first=True)
+        self.reporter.remember(job)
+        self.scheduler.changed()
+        return job
+
+    def call_off(self, job_id: str, caller: Caller) -> Job:
+        """Cancel a job that has not ended."""
+        job = self.reporter.job(job_id)
+        if (entry := self.queue.find(job_id)) is not None:
+            running = entry.running
+            self.scheduler.kill(entry, f"called off by {caller.subject}")
+            if not running:
+                job = self.reporter.remember(job.model_copy(update={"state": "cancelled", "reason": entry.killed}))
+        return job
+
+    async def stop(self, caller: Caller, reason: str) -> Stopped:
+        """Latch the e-stop in the body; answers once the body says so."""
+        began_s = self.clock.now()
+        self.body.order("stop", f"{caller.subject}: {reason}" if reason else caller.subject)
+        await self._until(stopped=True)
+        return self._stop_state(began_s)
+
+    async def resume(self, caller: Caller) -> Stopped:
+        began_s = self.clock.now()
+        self.body.order("resume", caller.subject)
+        await self._until(stopped=False)
+        self.scheduler.changed()
+        return self._stop_state(began_s)
+
+    async def _until(self, *, stopped: bool) -> None:
+        try:
+            async with self.clock.timeout(STOP_ANSWER_S):
+                while self.body.state is None or self.body.state.stopped != stopped:
+                    await self.clock.sleep(0.02)
+        except TimeoutError:
+            order = "stop" if stopped else "resume"
+            raise Unavailable(f"the body did not confirm the {order} within {STOP_ANSWER_S:g} s") from None
+
+    def _stop_state(self, began_s: float) -> Stopped:
+        state = self.body.state
+        return Stopped(
+            robot_id=self.settings.id,
+            stopped=state is None or state.stopped,
+            by="" if state is None else state.stopped_by,
+            after_s=max(0.0, self.clock.now() - began_s),
+        )
+
+
+def queued(entry: Entry) -> QueuedTask:
+    return QueuedTask(
+        task_id=entry.task_id,
+        kind="charge" if entry.kind == "job" else entry.kind,
+        plant_id=entry.plant_id,
+        epoch=entry.epoch,
+        state="running" if entry.running else "queued",
+        phase=entry.phase,
+        progress=entry.progress,
+    )
+
+
+def _pose2(pose: tuple[float, float, float]) -> Pose2:
+    return Pose2(x_m=pose[0], y_m=pose[1], yaw_rad=pose[2])
+
+
+def build(
+    settings: RobotSettings,
+    clock: Clock,
+    opener: Opener,
+    transport: PeerTransport | httpx.AsyncBaseTransport,
+    rng: random.Random,
+    *,
+    identity: Identity | None = None,
+    verifier: Verifier | None = None,
+    peers: Peers | None = None,
+    open_reads: bool = True,
+) -> Node:
+    """One robot's brain as a node. `verifier` None switches authentication off, for tests."""
+    from robot_service.api import make_app
+
+    mesh = Mesh(transport, identity, clock)
+    brain = Brain(settings, clock, opener, mesh, peers if peers is not None else Peers(), rng)
+    app = make_app(brain, verifier, open_reads)
+    app.state.brain = brain
+    loops = (brain.body.run, brain.robot.neighbours.run, brain.docks.run, brain.reporter.run, brain.scheduler.run)
+    return Node(id=settings.id, kind="robot", app=app, loops=loops)

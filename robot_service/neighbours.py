@@ -1,0 +1,104 @@
+"""What other robots tell of themselves: polled once a second from 1-hop neighbours while anybody moves."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from core.allocation.right_of_way import Other
+from core.clock import Clock
+from core.errors import GardenError
+from core.geometry.planar import Pose, distance_m
+from core.mesh.client import Mesh
+from core.mesh.peers import Peer, Peers
+from core.wire.robot import Position
+
+MOVING_EVERY_S = 1.0
+NEAR_EVERY_S = 0.5
+NEAR_M = 1.6
+STILL_EVERY_S = 5.0
+
+
+@dataclass(slots=True)
+class Heard:
+    position: Position
+    at_s: float
+
+
+@dataclass(slots=True)
+class Neighbours:
+    """The newest word of every neighbour. One that fell silent stays where it was."""
+
+    me: str
+    peers: Peers
+    mesh: Mesh
+    clock: Clock
+    moving: Callable[[], bool]
+    pose: Callable[[], Pose | None]
+    heard: dict[str, Heard] = field(default_factory=dict)
+    _asked_s: float = -1e9
+    _wake: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def run(self) -> None:
+        while True:
+            await self.poll()
+            await self._pause()
+
+    async def poll(self) -> None:
+        """Ask every 1-hop robot now."""
+        robots = [peer for peer in self.peers.one_hop() if peer.kind == "robot" and peer.id != self.me]
+        if not robots:
+            return
+        self._asked_s = asked_s = self.clock.now()
+        answers = await self.mesh.ask_all(robots, "GET", "/position", expect=Position, each=None)
+        for peer in robots:
+            self._hear(peer, answers[peer.id], asked_s)
+
+    def _hear(self, peer: Peer, answer: Position | GardenError, asked_s: float) -> None:
+        if isinstance(answer, Position) and answer.robot_id == peer.id:
+            self.heard[peer.id] = Heard(answer, asked_s)
+
+    async def fresh(self, within_s: float = 0.5) -> None:
+        """Before the first move: hear the neighbours unless that was just done."""
+        if self.clock.now() - self._asked_s > within_s:
+            await self.poll()
+            self._wake.set()
+
+    async def _pause(self) -> None:
+        self._wake.clear()
+        try:
+            async with self.clock.timeout(self._every_s()):
+                await self._wake.wait()
+        except TimeoutError:
+            pass
+
+    def _every_s(self) -> float:
+        mine = self.moving()
+        if not mine and not any(heard.position.moving for heard in self.heard.values()):
+            return STILL_EVERY_S
+        pose = self.pose()
+        near = pose is not None and any(
+            distance_m(pose, (h.position.pose.x_m, h.position.pose.y_m)) < NEAR_M for h in self.heard.values()
+        )
+        return NEAR_EVERY_S if mine and near else MOVING_EVERY_S
+
+    def others(self) -> list[Other]:
+        """Everybody as last heard, with the age of the word."""
+        now_s = self.clock.now()
+        return [_other(heard, now_s) for heard in self.heard.values()]
+
+
+def _other(heard: Heard, now_s: float) -> Other:
+    said = heard.position
+    return Other(
+        robot_id=said.robot_id,
+        x_m=said.pose.x_m,
+        y_m=said.pose.y_m,
+        v_mps=said.v_mps,
+        moving=said.moving,
+        docked=bool(said.docked_at),
+        rank=said.rank,
+        route=tuple((point.x_m, point.y_m) for point in said.route),
+        age_s=now_s - heard.at_s,
+    )

@@ -1,0 +1,113 @@
+"""Takes one task apart into jobs (undock, navigate, dock, act) and oversees them. Paper 000, section 2.1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from core.allocation.bidding import BATTERY_ENOUGH_RATIO, Travel
+from core.allocation.queue import Entry
+from core.errors import GardenError, PeerDown
+from core.mesh.client import retry
+from core.wire.market import Announcement, Permit, PermitRequest, Report
+from core.wire.robot import JobRequest
+from robot_service.docks import Docks
+from robot_service.robot import RANK_IDLE, Robot, SkillFailed, reason_of, tuple_of
+from robot_service.skills.dock import dock_at
+from robot_service.skills.drive import drive_to, undock
+from robot_service.skills.supply import charge, refill
+from robot_service.skills.water import Poured, water
+
+TASK_S = {"water": 900.0, "charge": 5 * 3600.0, "refill": 900.0, "job": 900.0}
+"""Longest time for a whole task; a longer one is given back."""
+
+
+@dataclass(slots=True)
+class Planner:
+    robot: Robot
+    docks: Docks
+    travel: Travel
+
+    async def run(self, entry: Entry, wanted: bool) -> Report:
+        """Do one entry; the report says how it ended. `wanted` tells a charge that tasks wait. Never raises SkillFailed."""
+        poured = Poured()
+        try:
+            async with self.robot.clock.timeout(TASK_S.get(entry.kind, 900.0)):
+                await self._perform(entry, poured)
+        except TimeoutError:
+            return self._ended(entry, "failed", f"took longer than {TASK_S.get(entry.kind, 900.0):.0f} s", poured)
+        except GardenError as error:
+            return self._ended(entry, "failed", poured.why or reason_of(error), poured)
+        return self._ended(entry, "failed" if poured.why else "done", poured.why, poured)
+
+    def _ended(self, entry: Entry, state: str, reason: str, poured: Poured) -> Report:
+        delivered_ml = poured.delivered_ml if entry.kind == "water" else None
+        return Report(
+            robot_id=self.robot.settings.id,
+            epoch=entry.epoch,
+            state="done" if state == "done" else "failed",
+            phase=entry.phase,
+            progress=1.0 if state == "done" else entry.progress,
+            reason=reason,
+            delivered_ml=delivered_ml,
+        )
+
+    async def _perform(self, entry: Entry, poured: Poured) -> None:
+        self.robot.activity.waiting = ""
+        if entry.kind == "water" and entry.announcement is not None:
+            await self._water(entry, entry.announcement, poured)
+        elif entry.kind == "charge":
+            await charge(
+                self.robot, self.docks, self.travel, lambda ratio: entry.killed != "" and ratio > BATTERY_ENOUGH_RATIO
+            )
+        elif entry.kind == "refill":
+            await refill(self.robot, self.docks, self.travel)
+        elif entry.job is not None:
+            await self._job(entry.job)
+        else:
+            raise SkillFailed(f"cannot {entry.kind}")
+
+    async def _water(self, entry: Entry, asked: Announcement, poured: Poured) -> None:
+        await dock_at(self.robot, self.docks, asked.plant.plant_id)
+        self.robot.activity.job = "act"
+        entry.progress = 0.6
+        await water(self.robot, asked.plant, lambda: self._permit(entry, asked), poured)
+
+    async def _permit(self, entry: Entry, asked: Announcement) -> tuple[Permit, float]:
+        """Ask the plant for leave to pour. A lost answer is asked for again under the same key, and is the same permit."""
+        plant = self.robot.peers.get(asked.plant.plant_id)
+        wish = PermitRequest(robot_id=self.robot.settings.id, epoch=entry.epoch, act="water", amount_ml=asked.dose_ml)
+        asked_s = self.robot.clock.now()
+
+        async def ask() -> Permit:
+            self.robot.state()
+            return await self.robot.mesh.call(
+                plant,
+                "POST",
+                f"/tasks/{asked.task_id}/permits",
+                wish,
+                expect=Permit,
+                key=f"permit-{asked.task_id}-{entry.epoch}",
+            )
+
+        entry.committed = True
+        try:
+            permit = await retry(self.robot.clock, self.robot.rng, ask, tries=4, base_s=0.3, cap_s=2.0)
+        except PeerDown:
+            raise SkillFailed("the plant did not answer whether it may be watered") from None
+        entry.progress = 0.75
+        return permit, asked_s
+
+    async def _job(self, job: JobRequest) -> None:
+        robot = self.robot
+        if job.kind == "dock":
+            await dock_at(robot, self.docks, job.at)
+            return
+        if robot.where.docked_at or job.kind == "undock":
+            await undock(robot, self.docks)
+        if job.kind == "home":
+            await drive_to(robot, tuple_of(robot.settings.home), rank=RANK_IDLE)
+        elif job.kind == "goto":
+            pose = robot.pose()
+            yaw = job.yaw_rad if job.yaw_rad is not None else pose[2]
+            goal = (job.x_m if job.x_m is not None else pose[0], job.y_m if job.y_m is not None else pose[1], yaw)
+            await drive_to(robot, goal, yaw_matters=job.yaw_rad is not None)

@@ -1,0 +1,240 @@
+"""Keeps the queue moving: what is next, who is told, what is taken away, and what to do when there is nothing to do."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from dataclasses import dataclass, field
+from typing import Any
+
+from core.allocation.bidding import (
+    BATTERY_ENOUGH_RATIO,
+    BATTERY_FORCED_RATIO,
+    BATTERY_LOW_RATIO,
+    TANK_RESERVE_ML,
+)
+from core.allocation.queue import Entry, TaskQueue
+from core.allocation.right_of_way import RANK_IDLE, in_the_way_of
+from core.errors import GardenError
+from core.geometry.planar import distance_m
+from core.robots import gardener
+from core.wire.market import Report
+from robot_service.docks import Docks
+from robot_service.planner import Planner
+from robot_service.reporter import Reporter
+from robot_service.robot import RANK_BUSY, Halted, Robot, SkillFailed, reason_of, tuple_of
+from robot_service.skills.dock import insist
+from robot_service.skills.drive import drive_to, undock
+
+IDLE_LOOK_S = 2.0
+HOME_M = 0.25
+AFTER_FAILURE_S = 5.0
+OWN_RETRY_S = 60.0
+"""An errand of our own that failed is not tried again sooner."""
+
+
+@dataclass(slots=True)
+class Scheduler:
+    robot: Robot
+    docks: Docks
+    planner: Planner
+    queue: TaskQueue
+    reporter: Reporter
+    began_s: float = 0.0
+    _work: asyncio.Task[Any] | None = None
+    _idling: bool = False
+    _changed: asyncio.Event = field(default_factory=asyncio.Event)
+    _own_after_s: float = 0.0
+    _own_number: int = 0
+
+    # ------------------------------------------------------------------ what others do to the queue
+    def changed(self) -> None:
+        """Something was added: leave idleness, or a charge that is enough."""
+        self._changed.set()
+        if self._idling and self._work is not None:
+            self._work.cancel()
+        head = self.queue.next()
+        if head is not None and head.running and head.kind == "charge" and len(self.queue.entries) > 1:
+            head.killed = head.killed or "a task waits"
+
+    def kill(self, entry: Entry, why: str) -> None:
+        """Take an entry away: at once before the permit, after the dose beyond it."""
+        entry.killed = why
+        if not entry.running:
+            self.queue.drop(entry)
+            self.robot.note("kill", f"{entry.kind} dropped: {why}", task_id=entry.task_id)
+        elif not entry.committed and self._work is not None:
+            self._work.cancel()
+
+    def halt(self, why: str) -> None:
+        """The e-stop: everything in the queue is given back."""
+        for entry in list(self.queue.entries):
+            if entry.running:
+                continue
+            self.queue.drop(entry)
+            if entry.announcement is not None:
+                self.reporter.finish(entry, _gave_up(self.robot.settings.id, entry, why))
+        head = self.queue.next()
+        if head is not None and head.running and not head.committed and self._work is not None and not head.killed:
+            head.killed = why
+            self._work.cancel()
+
+    # ------------------------------------------------------------------ the loop
+    async def run(self) -> None:
+        while True:
+            self._changed.clear()
+            entry = self._choose()
+            if entry is None:
+                await self._idle_until_changed()
+            else:
+                await self._execute(entry)
+
+    def _choose(self) -> Entry | None:
+        """The next entry, a needed errand of our own before it."""
+        if self._stopped():
+            return None
+        head = self.queue.next()
+        if (own := self._own_errand(head)) and self.robot.clock.now() >= self._own_after_s:
+            if not self.queue.has(own):
+                self._own_number += 1
+                self.queue.push(Entry(task_id=f"{self.robot.settings.id}:{own}:{self._own_number}", kind=own), first=True)  # type: ignore[arg-type]
+        return self.queue.next()
+
+    def _stopped(self) -> bool:
+        state = self.robot.body.state
+        return state is None or bool(self.robot.body.down) or state.stopped
+
+    def _own_errand(self, head: Entry | None) -> str:
+        state = self.robot.body.state
+        if state is None or (head is not None and head.kind in ("charge", "refill", "job")):
+            return ""
+        limit_ratio = BATTERY_FORCED_RATIO if head is not None else BATTERY_LOW_RATIO
+        resting = bool(self.robot.where.docked_at)
+        if state.battery_ratio < limit_ratio and (head is not None or not resting):
+            return "charge"
+        dose_ml = head.announcement.dose_ml if head is not None and head.announcement is not None else 0.0
+        if state.tank_ml is not None and head is not None and state.tank_ml < dose_ml + TANK_RESERVE_ML:
+            return "refill"
+        return ""
+
+    async def _execute(self, entry: Entry) -> None:
+        entry.running, self.began_s = True, self.robot.clock.now()
+        self.robot.note("task", f"begins {entry.kind} {entry.plant_id}".strip(), task_id=entry.task_id)
+        report, cut = await self._worked(self.planner.run(entry, bool(self.queue.entries)))
+        self.queue.drop(entry)
+        self._rest()
+        if report is None:
+            report = _gave_up(self.robot.settings.id, entry, entry.killed or "interrupted")
+        outcome = f"{entry.kind} {report.state}" + (f": {report.reason}" if report.reason else "")
+        self.robot.note("task", outcome, task_id=entry.task_id, delivered_ml=report.delivered_ml)
+        if entry.announcement is not None and not (cut and entry.killed):
+            self.reporter.finish(entry, report)
+        if entry.announcement is None and report.state == "failed":
+            self._own_after_s = self.robot.clock.now() + OWN_RETRY_S
+        self.reporter.jobs_ended(entry, report)
+        if cut and self.robot.where.docked_at and not self._stopped():
+            await self._worked(self._leave())
+
+    async def _worked(self, work: Coroutine[Any, Any, Any]) -> tuple[Any, bool]:
+        """Run it as a task of its own that `kill` can cancel. Returns (result, cut short)."""
+        self._work = asyncio.create_task(work)
+        try:
+            await asyncio.wait({self._work})
+            if self._work.cancelled():
+                return None, True
+            return self._work.result(), False
+        finally:
+            if not self._work.done():
+                self._work.cancel()
+            self._work = None
+
+    async def _leave(self) -> None:
+        try:
+            await undock(self.robot, self.docks)
+        except SkillFailed as error:
+            self.robot.note("undock", reason_of(error))
+
+    def _rest(self) -> None:
+        activity = self.robot.activity
+        activity.job, activity.waiting, activity.route = "idle", "", []
+        activity.rank = RANK_BUSY if self.robot.where.docked_at else RANK_IDLE
+        self.robot.body.want("stop")
+
+    # ------------------------------------------------------------------ idleness
+    async def _idle_until_changed(self) -> None:
+        if self.queue.entries and not self._stopped():
+            return
+        self._idling = True
+        try:
+            await self._worked(self._idle())
+        finally:
+            self._idling = False
+
+    async def _idle(self) -> None:
+        """One round of what an idle robot does; returns so that the queue is looked at again."""
+        self._rest()
+        try:
+            if self._stopped():
+                await self._dwell()
+            elif self.robot.where.docked_at:
+                await self._rest_on_dock(self.robot.where.docked_at)
+            else:
+                await self._stand_by()
+        except Halted:
+            await self.robot.clock.sleep(IDLE_LOOK_S)
+        except SkillFailed as error:
+            self.robot.activity.waiting = reason_of(error)
+            self.robot.note("idle", reason_of(error))
+            self.robot.body.want("stop")
+            await self.robot.clock.sleep(AFTER_FAILURE_S)
+
+    async def _dwell(self) -> None:
+        state = self.robot.body.state
+        self.robot.activity.job = "stopped" if state is not None and state.stopped else "idle"
+        self.robot.activity.waiting = self.robot.body.down or (
+            f"stopped by {state.stopped_by or 'the e-stop'}" if state else ""
+        )
+        self.robot.body.rest(True)
+        await self.robot.clock.sleep(1.0)
+
+    async def _rest_on_dock(self, name: str) -> None:
+        """Stay and charge until somebody wants the dock."""
+        hold = self.docks.holds.get(name)
+        if hold is None or not hold.yielding or hold.lost:
+            await insist(self.robot, self.docks, self.robot.dock(name), yielding=True)
+            hold = self.docks.holds.get(name)
+        if hold is not None and (hold.wanted_by or hold.lost):
+            self.robot.note("yield", f"leaves {name} to {hold.wanted_by or 'its owner'}")
+            await undock(self.robot, self.docks)
+            await self._go_home()
+            return
+        self.robot.body.rest(True)
+        await self.robot.clock.sleep(IDLE_LOOK_S)
+
+    async def _stand_by(self) -> None:
+        for name in list(self.docks.holds):
+            await self.docks.release(name)
+        home = tuple_of(self.robot.settings.home)
+        pose = self.robot.where.pose
+        if pose is None:
+            self.robot.activity.waiting = self.robot.where.lost
+            self.robot.body.rest(False)
+            await self.robot.clock.sleep(IDLE_LOOK_S)
+            return
+        me = (RANK_IDLE, self.robot.settings.id)
+        if distance_m(pose, home) > HOME_M or in_the_way_of(me, pose, self.robot.neighbours.others()):
+            await self._go_home()
+            return
+        self.robot.body.rest(True)
+        await self.robot.clock.sleep(IDLE_LOOK_S)
+
+    async def _go_home(self) -> None:
+        self.robot.activity.job = "home"
+        await drive_to(self.robot, tuple_of(self.robot.settings.home), rank=RANK_IDLE)
+
+
+def _gave_up(robot_id: str, entry: Entry, why: str) -> Report:
+    return Report(robot_id=robot_id, epoch=entry.epoch, state="failed", phase=entry.phase, reason=why[:500])
+
+
+__all__ = ["BATTERY_ENOUGH_RATIO", "GardenError", "Scheduler", "gardener"]

@@ -1,0 +1,69 @@
+"""Moving the arm open loop: legs that are clear of pot and dock, one after another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from core.errors import Refused
+from core.manipulation.arm import Joints, nozzle_goal
+from core.manipulation.swing import Leg, fold, leg_s, swing
+from core.robots import gardener
+from robot_service.robot import Robot, SkillFailed
+
+FIRST_FOLD_S = 2.0
+"""An arm whose place nobody knows jumps at its first move; it goes to the folded pose."""
+SETTLE_S = 0.3
+LEG_LATE_S = 5.0
+
+
+def joints_now(robot: Robot) -> Joints:
+    """Where the board commands the arm; the folded pose until it was ever driven."""
+    state = robot.body.state
+    if state is None or state.arm_rad is None or len(state.arm_rad) < 4:
+        return gardener.ARM_HOME_RAD
+    a, b, c, d = state.arm_rad[:4]
+    return a, b, c, d
+
+
+def is_folded(robot: Robot) -> bool:
+    if robot.body.state is None or robot.body.state.arm_rad is None:
+        return False
+    return all(abs(a - b) < 0.03 for a, b in zip(joints_now(robot), gardener.ARM_HOME_RAD, strict=True))
+
+
+async def move_arm(robot: Robot, legs: Iterable[Leg]) -> None:
+    """Run the legs; each ends when its time is over and the board says that nothing moves."""
+    robot.body.rest(False)
+    for leg in legs:
+        began_s = robot.clock.now()
+        while True:
+            robot.body.want(arm=leg.q, arm_s=leg.duration_s)
+            state = await robot.tick()
+            spent_s = robot.clock.now() - began_s
+            if spent_s > leg.duration_s + SETTLE_S and not state.arm_moving:
+                break
+            if spent_s > leg.duration_s + LEG_LATE_S:
+                raise SkillFailed(f"the arm did not get there: {state.refusal or 'it still moves'}")
+
+
+async def fold_arm(robot: Robot) -> None:
+    """Back over the body, as it must be before the base moves."""
+    if is_folded(robot):
+        return
+    now = joints_now(robot)
+    try:
+        legs = fold(now) if robot.state().arm_rad is not None else (Leg(q=now, duration_s=FIRST_FOLD_S),)
+    except Refused:
+        legs = (Leg(q=gardener.ARM_HOME_RAD, duration_s=2 * leg_s(now, gardener.ARM_HOME_RAD)),)
+    await move_arm(robot, legs)
+
+
+async def reach(robot: Robot, point_base_m: tuple[float, float, float]) -> Joints:
+    """Bring the nozzle to a point in the base frame; returns the joints held there."""
+    try:
+        goal = nozzle_goal(point_base_m)
+        legs = swing(joints_now(robot), goal)
+    except Refused as error:
+        raise SkillFailed(f"the nozzle cannot reach the soil: {error}") from error
+    await move_arm(robot, legs)
+    return goal

@@ -1,0 +1,76 @@
+"""Water: the nozzle over the soil, a permit, a measured dose, the drip, the arm home. Done at the dock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from core.allocation.bidding import DRIP_S
+from core.geometry.planar import between
+from core.robots import gardener
+from core.wire.market import Permit, PlantCard
+from robot_service.robot import Robot, SkillFailed
+from robot_service.skills.arm import fold_arm, reach
+
+STALL_S = 5.0
+ENOUGH_ML = 1.0
+DRY_ML = 4.0
+"""The tank's sensor reads this little when nothing comes any more."""
+
+TakePermit = Callable[[], Awaitable[tuple[Permit, float]]]
+"""Asks the plant; returns the permit and when it was asked for [garden s]."""
+
+
+@dataclass(slots=True)
+class Poured:
+    """What came out, and why it was less than asked; empty `why` when it was not."""
+
+    delivered_ml: float = 0.0
+    why: str = ""
+
+
+def nozzle_in_base(pose: tuple[float, float, float], plant: PlantCard) -> tuple[float, float, float]:
+    """The plant's nozzle point in the frame of a base at `pose` [m]; the plant's x points at its dock."""
+    towards_dock_rad = plant.dock.yaw_rad + math.pi
+    cos, sin = math.cos(towards_dock_rad), math.sin(towards_dock_rad)
+    x_m = plant.stem.x_m + cos * plant.nozzle.x_m - sin * plant.nozzle.y_m
+    y_m = plant.stem.y_m + sin * plant.nozzle.x_m + cos * plant.nozzle.y_m
+    along_m, aside_m, _ = between(pose, (x_m, y_m, 0.0))
+    return along_m, aside_m, plant.stem.z_m + plant.nozzle.z_m
+
+
+async def water(robot: Robot, plant: PlantCard, take_permit: TakePermit, poured: Poured) -> None:
+    """Deliver one dose. `poured` tells what came out whatever happens; raises SkillFailed when nothing could be begun."""
+    await reach(robot, nozzle_in_base(robot.pose(), plant))
+    permit, asked_s = await take_permit()
+    await _pour(robot, permit, asked_s, poured)
+    await _drip(robot, DRIP_S)
+    await fold_arm(robot)
+
+
+async def _pour(robot: Robot, permit: Permit, asked_s: float, poured: Poured) -> None:
+    began_s = grown_s = robot.clock.now()
+    if began_s - asked_s > permit.valid_for_s:
+        raise SkillFailed("the permit ran out before the pump could start")
+    longest_s = permit.dose_ml / gardener.PUMP_MLPS * 2 + STALL_S
+    while True:
+        robot.body.want(pump=True, permit_id=permit.permit_id, dose_ml=permit.dose_ml)
+        state = await robot.tick()
+        if state.permit_id == permit.permit_id and state.pumped_ml > poured.delivered_ml:
+            poured.delivered_ml, grown_s = state.pumped_ml, robot.clock.now()
+        if poured.delivered_ml >= permit.dose_ml - ENOUGH_ML:
+            return
+        if robot.clock.now() - grown_s > STALL_S or robot.clock.now() - began_s > longest_s:
+            poured.why = f"the pump stopped at {poured.delivered_ml:.0f} ml: {state.refusal or 'no more came'}"
+            return
+        if state.tank_ml is not None and state.tank_ml < DRY_ML:
+            poured.why = f"the tank ran dry after {poured.delivered_ml:.0f} ml"
+            return
+
+
+async def _drip(robot: Robot, seconds: float) -> None:
+    until_s = robot.clock.now() + seconds
+    while robot.clock.now() < until_s:
+        robot.body.want()
+        await robot.tick()
