@@ -11,6 +11,8 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from hw.protocols.create import Model
+from sim.devices.create import CreateEmulator
 from sim.devices.create_dock import Side
 from sim.devices.plants import CreateSense
 
@@ -38,7 +40,7 @@ class Pose:
 
 
 class BenchCreate:
-    """Fills `sim.devices.plants.CreateBody` and, for `garden emulate`, `Bench` (`advance`)."""
+    """Fills `sim.devices.plants.CreateBody`; `advance` moves it. The first call only sets its time."""
 
     def __init__(
         self,
@@ -60,7 +62,7 @@ class BenchCreate:
         self._speed = [0.0, 0.0]
         self._travel = [0.0, 0.0]
         self._blocked = False
-        self._now_s = 0.0
+        self._now_s: float | None = None
         self.charge_ah = 5.0
         self.capacity_ah = 6.77
         self.extra: dict[str, bool] = {}
@@ -83,10 +85,12 @@ class BenchCreate:
 
     def advance(self, now_s: float) -> None:
         """Move on to `now_s`."""
-        while (left_s := now_s - self._now_s) > 1e-9:
+        at_s = now_s if self._now_s is None else self._now_s
+        while (left_s := now_s - at_s) > 1e-9:
             dt_s = min(left_s, STEP_S_MAX)
             self._step(dt_s)
-            self._now_s += dt_s
+            at_s += dt_s
+        self._now_s = at_s
 
     def sense(self) -> CreateSense:
         red, green, field = self._beams()
@@ -151,3 +155,28 @@ class BenchCreate:
 
 def _wrap(angle_rad: float) -> float:
     return math.remainder(angle_rad, math.tau)
+
+
+class BenchedCreate(CreateEmulator):
+    """A Create that brings its own plane: whoever steps the firmware moves the body too."""
+
+    def __init__(self, model: Model, body: BenchCreate, rng: random.Random, *, red_side: Side = "left") -> None:
+        super().__init__(model, body, rng, red_side=red_side)
+        self.bench = body
+        body.may_charge = lambda: self.may_charge
+
+    def step(self, now_s: float) -> None:
+        self.bench.advance(now_s)
+        super().step(now_s)
+
+
+def create1(seed: int) -> BenchedCreate:
+    """A Create 1, a metre before its dock."""
+    rng = random.Random(seed)
+    return BenchedCreate(Model.CREATE1, BenchCreate(rng, wheelbase_m=0.258), rng)
+
+
+def create2(seed: int) -> BenchedCreate:
+    """A Create 2, a metre before its dock."""
+    rng = random.Random(seed)
+    return BenchedCreate(Model.CREATE2, BenchCreate(rng, wheelbase_m=0.235), rng)
