@@ -15,7 +15,7 @@ import structlog
 from core.clock import Clock
 from core.errors import StorageError
 from core.robots import gardener
-from core.wire.body import BodyState, Control, Setpoint
+from core.wire.body import COMMAND_LIFE_S, BodyState, Control, Setpoint
 from hw.drivers.create import CreateDriver
 from hw.drivers.ssc32 import Ssc32Driver
 from hw.drivers.stargazer import StargazerDriver
@@ -171,7 +171,7 @@ class BodyNode:
         """A fresh setpoint asks for something that does not stand so already."""
         new_arm = setpoint.arm is not None and setpoint.arm != self.actuators.said.arm
         wants = setpoint.base != "stop" or setpoint.pump or new_arm
-        return wants and now_s - self.brain.heard_s < REST_AFTER_S
+        return wants and now_s - self.brain.heard_s < COMMAND_LIFE_S
 
     def _rest(self, resting: bool, now_s: float) -> None:
         if resting is self._resting:

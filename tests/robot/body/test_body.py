@@ -18,7 +18,8 @@ from core.wire.body import Setpoint
 from hw.ports import MarkerFix
 
 _spec = importlib.util.spec_from_file_location("body_stand_ins", Path(__file__).with_name("stand_ins.py"))
-assert _spec is not None and _spec.loader is not None
+assert _spec is not None
+assert _spec.loader is not None
 stand_ins = sys.modules.setdefault("body_stand_ins", importlib.util.module_from_spec(_spec))
 _spec.loader.exec_module(stand_ins)
 Rig, DOCKED, DOWN, UP = stand_ins.Rig, stand_ins.DOCKED, stand_ins.DOWN, stand_ins.UP
