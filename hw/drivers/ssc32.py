@@ -25,7 +25,7 @@ SETTLE_S = 0.5
 """A move is watched this much longer than it should take."""
 ASK_VERSION_S = 0.4
 SILENCE_POLLS = 2.5
-SILENCE_S_MIN = 0.5
+SILENCE_S_MIN = 0.8
 SILENCE_S_MAX = SILENCE_POLLS * POLL_RESTING_S
 BUFFER_BYTES_MAX = 256
 
@@ -157,11 +157,16 @@ class Ssc32Driver(Session):
             return
 
     def _ask(self, channels: tuple[int, ...]) -> None:
-        """One write for everything: pulses, analog inputs, and `Q`, whose answer marks the end."""
+        """One write for everything: pulses, analog inputs, and `Q`, whose answer marks the end.
+
+        Outputs are said again each time: nothing can be read back, and one flipped bit makes an H of an L.
+        """
         self._buffer.clear()
         self._asked = channels
+        levels = {output: output in self._high for output in sorted(self._outputs)}
+        outputs = wire.encode_outputs(levels) if levels else b""
         pulses = wire.encode_query_pulses(channels) if channels else b""
-        self._send(pulses + wire.encode_query_analog(range(self._analog_inputs)) + wire.QUERY_MOVING)
+        self._send(outputs + pulses + wire.encode_query_analog(range(self._analog_inputs)) + wire.QUERY_MOVING)
 
     def _received(self, data: bytes) -> None:
         self._buffer += data

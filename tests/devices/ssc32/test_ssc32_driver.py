@@ -118,6 +118,31 @@ def test_stop_is_one_write_with_the_pump_first(at_desk: Run) -> None:
     at_desk(story)
 
 
+def test_an_output_that_noise_switched_on_is_soon_off_again(at_desk: Run) -> None:
+    async def story(desk: Desk) -> None:
+        desk.cable.tap.inner.receive(b"#8H\r", desk.clock.now())
+        assert desk.rig.outputs[PUMP]
+        await desk.clock.sleep(0.6)
+        assert not desk.rig.outputs[PUMP]
+
+    at_desk(story)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_percent_of_damaged_bytes_never_leave_the_pump_running(at_desk: Run, seed: int) -> None:
+    async def story(desk: Desk) -> None:
+        desk.cable.host.noise(0.02, random.Random(seed))
+        for _ in range(20):
+            desk.driver.output(PUMP, True)
+            await desk.clock.sleep(1.0)
+            desk.driver.stop()
+            await desk.clock.sleep(4.0)
+            assert not desk.rig.outputs.get(PUMP, False), f"seed {seed}"
+        desk.cable.host.noise(0.0)
+
+    at_desk(story)
+
+
 def test_polling_is_slow_at_rest_and_fast_in_motion(at_desk: Run) -> None:
     async def story(desk: Desk) -> None:
         async def polls(seconds: float) -> int:
