@@ -21,6 +21,10 @@ FRONT_RAD = math.radians(95.0)
 MIDDLE_RAD = math.radians(18.0)
 """Within this angle of straight ahead both switches close."""
 
+ARM_PARTS = frozenset(
+    ("pan-hub", "upper-arm", "forearm", "palm", "hose", "rail-left", "rail-right", "pad-left", "pad-right")
+)
+
 Key = tuple[str, str]
 
 
@@ -114,7 +118,7 @@ def _owner(name: str, robots: set[str]) -> tuple[str, str]:
     head, _, tail = name.rpartition("/")
     if tail in ("pot", "dock"):
         return tail, head
-    robot = name.split("/", 1)[0]
-    if robot in robots:
-        return ("shell" if tail == "shell" else "arm"), robot
-    return "ground", name
+    robot, _, part = name.partition("/")
+    if robot in robots and part == "shell":
+        return "shell", robot
+    return ("arm", robot) if robot in robots and part in ARM_PARTS else ("ground", name)

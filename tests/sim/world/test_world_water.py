@@ -154,3 +154,17 @@ def test_the_folded_arm_stays_within_the_footprint(world: World) -> None:
         x_m, y_m, _ = world.data.site(f"robot-1/{site}").xpos
         assert world.robots["robot-1"].pose.x_m == pytest.approx(0.0, abs=0.01)
         assert (x_m**2 + y_m**2) ** 0.5 < g.BODY_RADIUS_M
+
+
+def test_an_arm_that_strikes_the_pot_is_stopped_by_it_and_counted(world: World, quiet: Callable[[World], None]) -> None:
+    dock = world.scenario.docks()["plant-1"]
+    world.teleport("robot-1", dock.x_m, dock.y_m, dock.yaw_rad)
+    for joint, angle in {"shoulder": -0.17, "elbow": 0.0, "wrist": 0.0}.items():
+        servo = g.SERVOS[joint]
+        world.servo_rig("robot-1").set_pulse(servo.channel, servo.pulse_us(angle))
+    world.advance(4.0)
+    truth = world.truth().robot("robot-1")
+    assert truth.collisions.arm == 1
+    assert not truth.fallen
+    assert truth.arm_rad[1] > -0.15
+    quiet(world)
