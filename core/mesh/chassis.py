@@ -77,12 +77,14 @@ def create_app(
     registry: CollectorRegistry | None = None,
     body_bytes_max: int = 65536,
     open_reads: bool = True,
+    page: str = "",
 ) -> FastAPI:
     """A node's HTTP side, to which the service adds its own routes.
 
     `ready` lists what is still missing (empty: ready). `verifier` None switches authentication off, for tests.
     With `open_reads` false every request but health needs a token. Every POST with an `Idempotency-Key` is answered once
-    and the same again. `app.state` holds clock, verifier, events and registry.
+    and the same again. A browser that asks for `/` gets `page`, if there is one.
+    `app.state` holds clock, verifier, events and registry.
     """
     app = FastAPI(title="Robot Garden", version=version(), docs_url=None, redoc_url=None)
     registry = registry if registry is not None else CollectorRegistry()
@@ -96,7 +98,7 @@ def create_app(
         open_reads=open_reads,
     )
     _refusals(app)
-    _plain_routes(app, card, ready, registry)
+    _plain_routes(app, card, ready, registry, page)
     if events is not None:
         _event_route(app, events)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
@@ -125,10 +127,12 @@ def _refusals(app: FastAPI) -> None:
 
 
 def _plain_routes(
-    app: FastAPI, card: Callable[[], NodeCard], ready: Callable[[], list[str]], registry: CollectorRegistry
+    app: FastAPI, card: Callable[[], NodeCard], ready: Callable[[], list[str]], registry: CollectorRegistry, page: str
 ) -> None:
-    @app.get("/", summary="Node card", tags=["node"])
-    async def node_card() -> NodeCard:
+    @app.get("/", summary="Node card", tags=["node"], response_model=NodeCard)
+    async def node_card(request: Request) -> NodeCard | HTMLResponse:
+        if page and "text/html" in request.headers.get("accept", ""):
+            return HTMLResponse(page)
         return card()
 
     @app.get("/healthz", summary="The process answers", tags=["node"])

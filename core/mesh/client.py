@@ -106,7 +106,7 @@ class Mesh:
         Raises PeerDown when nobody answered in time or the answer is nonsense, else the error the peer's problem names.
         """
         answer = await self.exchange(peer, method, path, _dump(body), key=key, timeout_s=timeout_s)
-        return _read(peer, answer, expect)
+        return read(peer, answer, expect)
 
     async def exchange(
         self,
@@ -153,7 +153,7 @@ class Mesh:
             try:
                 async with gate:
                     answer = await self.exchange(peer, method, path, content, timeout_s=timeout_s)
-                answers[peer.id] = _read(peer, answer, expect)
+                answers[peer.id] = read(peer, answer, expect)
             except GardenError as error:
                 answers[peer.id] = error
             if each is not None:
@@ -186,7 +186,8 @@ def _adapter(expect: Any) -> TypeAdapter[Any]:
     return TypeAdapter(expect)
 
 
-def _read(peer: Peer, answer: Answer, expect: type[D]) -> D:
+def read(peer: Peer, answer: Answer, expect: type[D]) -> D:
+    """The answer's document; raises as `Mesh.call` does."""
     if answer.status >= 400:
         raise _error(peer, answer)
     if len(answer.body) > ANSWER_BYTES_MAX:

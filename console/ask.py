@@ -1,0 +1,227 @@
+"""The commands that talk to the garden's services."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
+from rich.console import Console, RenderableType
+from rich.live import Live
+
+from console import tables
+from console.folder import Folder
+from console.snapshot import all_tasks, look
+from core.clock import WallClock
+from core.errors import BadRequest, GardenError, NotFound, PeerDown
+from core.mesh.aio import AiohttpTransport
+from core.mesh.client import Mesh
+from core.mesh.peers import Peer, PeerKind, Peers
+from core.wire.documents import Document
+from core.wire.market import Task, TaskRequest
+from core.wire.plant import PlantState
+from core.wire.robot import Job, JobKind, JobRequest, RobotState, Stopped, StopRequest
+
+T = TypeVar("T")
+WATCH_S = 1.0
+POLL_S = 0.5
+NOBODY = "is the garden running? `make up` starts it, `garden doctor` looks closer"
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """The way to the garden's services."""
+
+    mesh: Mesh
+    peers: Peers
+
+    def peer(self, name: str, kind: PeerKind) -> Peer:
+        peer = self.peers.find(name)
+        if peer is None or peer.kind != kind:
+            known = ", ".join(peer.id for peer in self.peers.of_kind(kind))
+            raise NotFound(f"there is no {kind} {name!r}", hint=f"one of: {known or 'none'}")
+        return peer
+
+
+@asynccontextmanager
+async def open_line(data: Path, role: str = "") -> AsyncIterator[Line]:
+    """With a `role`, requests carry that role's token."""
+    folder = Folder(data)
+    mesh = Mesh(AiohttpTransport(), folder.identity(role) if role else None, WallClock(), timeout_s=3.0)
+    try:
+        yield Line(mesh, Peers(folder.peers()))
+    finally:
+        await mesh.aclose()
+
+
+def _run(data: Path, role: str, ask: Callable[[Line], Awaitable[T]]) -> T:
+    async def go() -> T:
+        async with open_line(data, role) as line:
+            return await ask(line)
+
+    try:
+        return asyncio.run(go())
+    except PeerDown as error:
+        error.hint = error.hint or NOBODY
+        raise
+
+
+def _show(result: Any, as_json: bool, view: Callable[[], RenderableType]) -> None:
+    if as_json:
+        print(json.dumps(_plain(result), indent=1))
+    else:
+        Console().print(view())
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    return [_plain(item) for item in value] if isinstance(value, list) else value
+
+
+async def _states(line: Line, kind: PeerKind, expect: type[T]) -> list[T]:
+    """All answers; raises the first error only when nobody answered."""
+    answers = await line.mesh.ask_all(line.peers.of_kind(kind), "GET", "/state", expect=expect)
+    good = [answer for answer in answers.values() if not isinstance(answer, GardenError)]
+    for name, answer in answers.items():
+        if isinstance(answer, GardenError):
+            if not good:
+                raise answer
+            print(f"garden: {name}: {answer}", file=sys.stderr)
+    return good
+
+
+def plants(data: Path, as_json: bool) -> None:
+    states = _run(data, "", lambda line: _states(line, "plant", PlantState))
+    _show(states, as_json, lambda: tables.plants(states))
+
+
+def robots(data: Path, as_json: bool) -> None:
+    states = _run(data, "", lambda line: _states(line, "robot", RobotState))
+    _show(states, as_json, lambda: tables.robots(states))
+
+
+def status(data: Path, watch: bool, as_json: bool) -> None:
+    if watch and not as_json:
+        try:
+            _run(data, "", _watch)
+        except KeyboardInterrupt:
+            return
+    snapshot = _run(data, "", lambda line: look(line.mesh, line.peers))
+    if not (snapshot.plants or snapshot.robots) and snapshot.silent:
+        raise PeerDown(snapshot.silent[0].why, hint=NOBODY)
+    _show(snapshot, as_json, lambda: tables.picture(snapshot))
+
+
+async def _watch(line: Line) -> None:
+    with Live(refresh_per_second=4, screen=True) as live:
+        while True:
+            live.update(tables.picture(await look(line.mesh, line.peers)))
+            await asyncio.sleep(WATCH_S)
+
+
+def tasks(task_id: str, data: Path, as_json: bool) -> None:
+    if task_id:
+        task = _run(data, "", lambda line: _find_task(line, task_id))
+        _show(task, as_json, lambda: tables.story(task))
+        return
+    listed = _run(data, "", _all_tasks)
+    _show(listed, as_json, lambda: tables.tasks(listed))
+
+
+async def _all_tasks(line: Line) -> list[Task]:
+    await _states(line, "plant", PlantState)  # raises when no pot answers at all
+    return await all_tasks(line.mesh, line.peers)
+
+
+async def _find_task(line: Line, task_id: str) -> Task:
+    """Only the pot that owns a task knows it, so all are asked."""
+    answers = await line.mesh.ask_all(line.peers.of_kind("plant"), "GET", f"/tasks/{task_id}", expect=Task)
+    for answer in answers.values():
+        if isinstance(answer, Task):
+            return answer
+    down = [answer for answer in answers.values() if isinstance(answer, PeerDown)]
+    if down and len(down) == len(answers):
+        raise down[0]
+    raise NotFound(f"no pot knows a task {task_id!r}", hint="`garden tasks` lists them")
+
+
+def water(plant: str, ml: float | None, data: Path, as_json: bool) -> None:
+    request = _request(TaskRequest, kind="water", dose_ml=ml)
+
+    async def ask(line: Line) -> Task:
+        return await line.mesh.call(line.peer(plant, "plant"), "POST", "/tasks", request, expect=Task)
+
+    task = _run(data, "operator", ask)
+    _show(task, as_json, lambda: f"{task.task_id}: {plant} asks for {task.dose_ml:g} ml; `garden tasks {task.task_id}`")
+
+
+D = TypeVar("D", bound=Document)
+
+
+def _request(model: type[D], **fields: Any) -> D:
+    """A request from command-line values; raises BadRequest in plain words."""
+    try:
+        return model(**fields)
+    except ValueError as error:
+        told = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in getattr(error, "errors", list)())
+        raise BadRequest(told or str(error)) from error
+
+
+async def _each_robot(line: Line, robot: str, path: str, body: Document | None) -> list[Stopped]:
+    """At one robot or at all; all are asked even when some do not answer, then the first error is raised."""
+    asked = [line.peer(robot, "robot")] if robot else line.peers.of_kind("robot")
+    answers = await line.mesh.ask_all(asked, "POST", path, body, expect=Stopped)
+    failed = {name: answer for name, answer in answers.items() if isinstance(answer, GardenError)}
+    for name, error in failed.items():
+        print(f"garden: {name} did NOT answer: {error}", file=sys.stderr)
+    if failed:
+        raise next(iter(failed.values()))
+    return [answer for answer in answers.values() if isinstance(answer, Stopped)]
+
+
+def _told_stopped(listed: list[Stopped]) -> str:
+    return "\n".join(f"{one.robot_id}: {f'stopped by {one.by}' if one.stopped else 'goes on'}" for one in listed)
+
+
+def stop(robot: str, reason: str, data: Path, as_json: bool) -> None:
+    request = _request(StopRequest, reason=reason)
+    stopped = _run(data, "operator", lambda line: _each_robot(line, robot, "/stop", request))
+    _show(stopped, as_json, lambda: _told_stopped(stopped))
+
+
+def resume(robot: str, data: Path, as_json: bool) -> None:
+    stopped = _run(data, "operator", lambda line: _each_robot(line, robot, "/resume", None))
+    _show(stopped, as_json, lambda: _told_stopped(stopped))
+
+
+def goto(robot: str, x_m: float, y_m: float, yaw_deg: float | None, wait: bool, data: Path, as_json: bool) -> None:
+    yaw_rad = None if yaw_deg is None else math.radians(yaw_deg)
+    _send_job(robot, _request(JobRequest, kind="goto", x_m=x_m, y_m=y_m, yaw_rad=yaw_rad), wait, data, as_json)
+
+
+def job(robot: str, kind: JobKind, where: str, wait: bool, data: Path, as_json: bool) -> None:
+    _send_job(robot, _request(JobRequest, kind=kind, at=where), wait, data, as_json)
+
+
+def _send_job(robot: str, request: JobRequest, wait: bool, data: Path, as_json: bool) -> None:
+    async def send(line: Line) -> Job:
+        peer = line.peer(robot, "robot")
+        sent = await line.mesh.call(peer, "POST", "/jobs", request, expect=Job)
+        while wait and sent.state in ("queued", "running"):
+            await asyncio.sleep(POLL_S)
+            sent = await line.mesh.call(peer, "GET", f"/jobs/{sent.job_id}", expect=Job)
+        return sent
+
+    ended = _run(data, "operator", send)
+    told = f"{ended.job_id}: {ended.kind} {ended.state}" + (f" ({ended.reason})" if ended.reason else "")
+    _show(ended, as_json, lambda: told)
+    if ended.state in ("failed", "cancelled"):
+        sys.exit(1)

@@ -1,0 +1,121 @@
+"""How the garden looks on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from console.snapshot import Silent, Snapshot
+from core.wire.market import FINAL_STATES, Bid, BidRound, Task
+from core.wire.plant import PlantState, StationState
+from core.wire.robot import RobotState
+
+TASKS_SHOWN = 8
+
+
+def picture(snapshot: Snapshot) -> RenderableType:
+    """Everything `garden status` shows."""
+    parts: list[RenderableType] = [plants(snapshot.plants), robots(snapshot.robots)]
+    if snapshot.stations:
+        parts.append(stations(snapshot.stations))
+    parts.append(tasks(snapshot.tasks[:TASKS_SHOWN]))
+    if snapshot.silent:
+        parts.append(silent(snapshot.silent))
+    return Group(*parts)
+
+
+def _table(title: str, *headings: str) -> Table:
+    table = Table(title=title, title_justify="left", expand=False)
+    for heading in headings:
+        table.add_column(heading)
+    return table
+
+
+def plants(states: Sequence[PlantState]) -> Table:
+    table = _table("Pots", "pot", "soil", "asks", "today ml", "tasks", "dock", "waiting for")
+    for state in states:
+        soil = state.soil
+        wet = f"{soil.ratio:.3f}" if soil.ratio is not None else f"{soil.state}: {soil.why}"
+        asks = "water" if state.thirsty else ""
+        open_tasks = ", ".join(state.open_tasks)
+        table.add_row(
+            state.plant_id, wet, asks, f"{state.watered_today_ml:.0f}", open_tasks, state.dock_holder, state.waiting
+        )
+    return table
+
+
+def robots(states: Sequence[RobotState]) -> Table:
+    table = _table("Robots", "robot", "at", "battery", "tank ml", "does", "task", "waiting for")
+    for state in states:
+        pose = state.pose
+        where = "?" if pose is None else f"{pose.x_m:+.2f} {pose.y_m:+.2f}"
+        where = f"dock of {state.docked_at}" if state.docked_at else where
+        does = Text(f"STOPPED by {state.stopped_by}", style="bold red") if state.stopped else Text(state.job or "idle")
+        tank = "?" if state.tank_ml is None else f"{state.tank_ml:.0f}"
+        task = state.queue[0].task_id if state.queue else ""
+        waiting = "; ".join(part for part in (state.waiting, *(f"down: {device}" for device in state.down)) if part)
+        table.add_row(state.robot_id, where, f"{state.battery_ratio:.0%}", tank, does, task, waiting)
+    return table
+
+
+def stations(states: Sequence[StationState]) -> Table:
+    table = _table("Station", "dock", "held by", "wanted by", "tap")
+    for state in states:
+        for dock in state.docks:
+            tap = ("open" if state.tap_open else "closed") if dock.tap else ""
+            table.add_row(f"{state.station_id}/{dock.dock_id}", dock.holder, dock.wanted_by, tap)
+    return table
+
+
+def tasks(listed: Sequence[Task]) -> Table:
+    table = _table("Tasks", "task", "kind", "state", "pot", "robot", "phase", "why")
+    for task in listed:
+        phase = "" if task.state in FINAL_STATES else task.phase
+        table.add_row(task.task_id, task.kind, task.state, task.plant_id, task.robot_id, phase, task.reason or task.why)
+    return table
+
+
+def silent(listed: Sequence[Silent]) -> Table:
+    table = _table("No answer", "who", "why")
+    for one in listed:
+        table.add_row(one.id, one.why)
+    return table
+
+
+def story(task: Task) -> RenderableType:
+    """One task from its first announcement to its end: who bid what, who won, and why."""
+    head = Text(f"{task.task_id}: {task.kind} for {task.plant_id}, {task.state}", style="bold")
+    lines = [f"asked by {task.asked_by or '?'} at {task.created_s:.1f} s: {task.why}", f"dose {task.dose_ml:g} ml"]
+    if task.delivered_ml is not None:
+        lines.append(f"delivered {task.delivered_ml:.1f} ml")
+    if task.reason:
+        lines.append(f"reason: {task.reason}")
+    parts: list[RenderableType] = [head, *lines]
+    parts += [auction(round_) for round_ in task.rounds]
+    events = _table("Events", "at s", "what", "robot", "epoch")
+    for event in task.events:
+        events.add_row(f"{event.t_s:.1f}", event.what, event.robot_id, str(event.epoch))
+    return Group(*parts, events)
+
+
+def auction(round_: BidRound) -> Table:
+    winner = round_.winner or "nobody"
+    table = _table(
+        f"At {round_.t_s:.1f} s (epoch {round_.epoch}): {winner} won. {round_.why}",
+        "robot", "cost s", "current", "queue", "travel", "work", "charge", "refill", "says",
+    )  # fmt: skip
+    for bid in sorted(round_.bids, key=_rank):
+        parts = bid.breakdown
+        cells = (parts.current_s, parts.queue_s, parts.travel_s, parts.work_s, parts.charge_s, parts.refill_s)
+        cost = "no" if bid.cost_s is None else f"{bid.cost_s:.1f}"
+        table.add_row(
+            bid.robot_id, cost, *(f"{seconds:.1f}" if bid.cost_s is not None else "" for seconds in cells), bid.reason
+        )
+    return table
+
+
+def _rank(bid: Bid) -> tuple[float, str]:
+    return (float("inf") if bid.cost_s is None else bid.cost_s, bid.robot_id)
