@@ -34,8 +34,7 @@ class _Channel:
     def pulse_us(self, now_s: float) -> float:
         if now_s >= self.end_s - 1e-9:
             return self.target_us
-        done = (now_s - self.start_s) / (self.end_s - self.start_s)
-        return self.start_us + (self.target_us - self.start_us) * max(0.0, done)
+        return self.start_us + (self.target_us - self.start_us) * (now_s - self.start_s) / (self.end_s - self.start_s)
 
 
 @dataclass(slots=True)

@@ -73,7 +73,8 @@ class StargazerEmulator:
                 self._obey(message, now_s)
 
     def step(self, now_s: float) -> None:
-        self._run_later(now_s)
+        if self._later:
+            self._run_later(now_s)
         if self._look_s is None:
             self._look_s = now_s + self._phase_s
         if now_s >= self._look_s - 1e-9:
@@ -86,8 +87,12 @@ class StargazerEmulator:
         return self._out.take()
 
     def due_s(self) -> float:
-        look_s = 0.0 if self._look_s is None else self._look_s if self._calculating else math.inf
-        return min(look_s, self._out.due_s(), *(due_s for due_s, _ in self._later), math.inf)
+        if self._look_s is None:
+            return 0.0
+        due_s = self._out.due_s()
+        if self._calculating and self._look_s < due_s:
+            due_s = self._look_s
+        return min(due_s, min(item[0] for item in self._later)) if self._later else due_s
 
     def _heard(self, data: bytes, now_s: float) -> bytes:
         """The bytes as the device's slow receiver takes them: too fast a byte is lost."""
