@@ -34,7 +34,7 @@ from plant_service.node import build as build_plant
 from plant_service.settings import PlantSettings
 from robot_service.body.body import build_body
 from robot_service.body.settings import BodySettings
-from robot_service.robot import build as build_robot
+from robot_service.brain import build as build_robot
 from robot_service.settings import RobotSettings
 from sim.service import make_node
 from sim.truth import Truth
