@@ -54,6 +54,7 @@ class World:
         station = scenario.station
         self.tap_board = TapBoard(tuple(f"{station.id}/{dock.id}" for dock in station.docks if dock.tap))
         self.touch = Touch(self.model, self.data, tuple(self.robots))
+        self._pot_discs: list[beams.Disc] = [(*pot.place, g.POT_RADIUS_M) for pot in self.pots.values()]
         self._owed_s = 0.0
         for name, robot in self.robots.items():
             robot.docks, robot.press = self.docks, self.touch.pressed[name]
@@ -108,9 +109,8 @@ class World:
         for robot in self.robots.values():
             robot.after(self.docks)
         discs = {name: (r.pose.x_m, r.pose.y_m, g.BODY_RADIUS_M) for name, r in self.robots.items()}
-        pots = [(*pot.place, g.POT_RADIUS_M) for pot in self.pots.values()]
         for name, robot in self.robots.items():
-            robot.discs = pots + [disc for other, disc in discs.items() if other != name]
+            robot.discs = self._pot_discs + [disc for other, disc in discs.items() if other != name]
         poses = {name: robot.pose for name, robot in self.robots.items()}
         self.touch.look(self.time_s, poses, {name: robot.docked_at for name, robot in self.robots.items()})
 
@@ -180,6 +180,7 @@ class World:
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Goes on from a snapshot of a world of the same scenario and seed; raises ConfigError for another's."""
         checkpoint.put_back(self, snapshot)
+        self._owed_s = 0.0
         mujoco.mj_forward(self.model, self.data)
         self._look()
 

@@ -16,15 +16,12 @@ TAP = StationDock(id="tap", x_m=-1.95, y_m=0.0, dock_yaw_deg=0.0, tap=True)
 SPARE = StationDock(id="spare", x_m=1.95, y_m=0.0, dock_yaw_deg=180.0)
 
 
-def plot(create: str = "create2", robots: int = 1) -> Scenario:
+def plot(robots: int = 1) -> Scenario:
     """One pot in a corner, a tap, and room to drive."""
     homes = [(0.0, 0.0), (0.0, -1.2)]
     return Scenario(
         plants=(Plant(id="plant-1", x_m=1.0, y_m=1.1, dock_yaw_deg=180.0, moisture_ratio=0.15),),
-        robots=tuple(
-            Robot.model_validate({"id": f"robot-{i + 1}", "x_m": x, "y_m": y, "create": create})
-            for i, (x, y) in enumerate(homes[:robots])
-        ),
+        robots=tuple(Robot(id=f"robot-{i + 1}", x_m=x, y_m=y) for i, (x, y) in enumerate(homes[:robots])),
         station=Station(docks=(TAP, SPARE)),
     )
 

@@ -147,20 +147,12 @@ def test_a_stop_at_the_first_cliff_keeps_the_robot_on_the_field(world: World) ->
     assert not robot.fallen
 
 
-def test_both_create_models_drive_on_their_own_wheels() -> None:
-    from core.scenario import Scenario
-
-    base = Scenario.model_validate(
-        {
-            "plants": [{"id": "plant-1", "x_m": 1.0, "y_m": 1.1, "dock_yaw_deg": 180.0}],
-            "robots": [{"id": "robot-1", "x_m": 0.0, "y_m": 0.0, "create": "create1"}],
-            "station": {"docks": [{"id": "tap", "x_m": -1.95, "y_m": 0.0, "dock_yaw_deg": 0.0, "tap": True}]},
-        }
-    )
-    world = World(base, 3)
-    robot = world.robots["robot-1"]
+def test_the_older_create_drives_on_its_own_wheels(world: World) -> None:
+    robots = tuple(robot.model_copy(update={"create": "create1"}) for robot in world.scenario.robots)
+    older = World(world.scenario.model_copy(update={"robots": robots}), 3)
+    robot = older.robots["robot-1"]
     robot.set_wheels(-0.129, 0.129)
-    world.advance(2.0)
+    older.advance(2.0)
     left, right = robot.drive.travel_m()
     believed = (right - left) / g.WHEELBASE_M["create1"]
     assert 0.88 < robot.pose.yaw_rad / believed < 0.97
