@@ -226,6 +226,7 @@ class FirmataValve:
         self._board.set_tap(self._pin, self._board.now() + for_s)
 
     async def shut(self) -> None:
+        """Shut now; while the link is down, first thing when it is back."""
         self._board.set_tap(self._pin, -math.inf)
 
     async def run(self) -> None:

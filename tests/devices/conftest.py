@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
+import hypothesis
 import pytest
 
 from core.clock import VirtualClock
@@ -13,6 +14,10 @@ from hw.drivers.session import Session
 from hw.links import MemoryNet
 from sim.devices.host import EmulatorHost
 from sim.devices.plants import Emulator
+
+# A shared machine's pauses are no fault of the code, and a test run must be repeatable.
+hypothesis.settings.register_profile("devices", deadline=None, derandomize=True, max_examples=60)
+hypothesis.settings.load_profile("devices")
 
 
 class Tap:
