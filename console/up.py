@@ -8,7 +8,7 @@ import fcntl
 import json
 import os
 import signal
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from core.wire.documents import HistoryEntry
 
 READY_WITHIN_S = 120.0
 POLL_S = 0.15
+TELL_S = 8.0
 QUIET = frozenset({"soil", "measured", "probe", "tap"})
 """Kinds of events too frequent to be told to a person."""
 
@@ -140,6 +141,7 @@ async def _greet(wish: Wish, scenario: Scenario, runner: Runner, voice: Voice) -
         async with asyncio.timeout(READY_WITHIN_S), asyncio.TaskGroup() as group:
             for name, peer in peers.items():
                 group.create_task(_wait_ready(mesh, name, peer, runner, voice, began_s))
+            group.create_task(_tell_late(peers, runner, voice))
     except TimeoutError:
         late = ", ".join(name for name in peers if not runner.children[name].ready)
         raise ConfigError(f"not ready after {READY_WITHIN_S:g} s: {late}", hint=f"see {wish.folder.logs}") from None
@@ -152,21 +154,24 @@ async def _greet(wish: Wish, scenario: Scenario, runner: Runner, voice: Voice) -
 
 
 async def _wait_ready(mesh: Mesh, name: str, peer: Peer, runner: Runner, voice: Voice, began_s: float) -> None:
-    loop = asyncio.get_running_loop()
-    why, told_s = "", began_s
-    while True:
-        try:
+    while not runner.children[name].ready:
+        with contextlib.suppress(GardenError):
             await mesh.call(peer, "GET", "/readyz", expect=Readiness)
+            runner.children[name].ready = True
             break
-        except GardenError as error:
-            why = str(error)
-        if loop.time() - told_s > 10.0:
-            told_s = loop.time()
-            voice.say(f"  still waiting for {name}: {why}", waiting=name, why=why)
         await asyncio.sleep(POLL_S)
-    runner.children[name].ready = True
-    seconds = loop.time() - began_s
+    seconds = asyncio.get_running_loop().time() - began_s
     voice.say(f"  {name:<12} ready after {seconds:4.1f} s   {peer.url}", ready=name, url=peer.url, seconds=round(seconds, 2))
+
+
+async def _tell_late(peers: Iterable[str], runner: Runner, voice: Voice) -> None:
+    """A word now and then, so that nobody thinks it hangs."""
+    last = asyncio.get_running_loop().time()
+    while late := [name for name in peers if not runner.children[name].ready]:
+        await asyncio.sleep(POLL_S)
+        if asyncio.get_running_loop().time() - last > TELL_S:
+            last += TELL_S
+            voice.say(f"  still starting: {', '.join(late)}", starting=late)
 
 
 def _say_ready(wish: Wish, scenario: Scenario, peers: dict[str, Peer], voice: Voice, seconds: float) -> None:

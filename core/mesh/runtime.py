@@ -21,7 +21,8 @@ from core.mesh.client import Mesh, PeerTransport
 from core.mesh.node import Loop, Node, serve
 from core.mesh.peers import Peer, Peers
 
-FIRST_TIME_WITHIN_S = 15.0
+FIRST_TIME_WITHIN_S = 90.0
+"""The world may still be compiling itself."""
 
 
 class GardenSettings(BaseSettings):

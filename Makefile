@@ -1,0 +1,46 @@
+# The verbs that people and CI use. `make up` on a fresh machine needs Python, git, make and a C compiler.
+.PHONY: install up test test-compose check bench reproduce soak docs
+.DEFAULT_GOAL := install
+
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+FOLDERS := core hw sim plant_service robot_service console lab tests
+ARGS ?=
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml uv.lock
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' \
+	  || { echo "Python 3.11 to 3.13 is needed; name one: make PYTHON=python3.12"; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@test -x $(BIN)/uv || $(BIN)/python -m pip install --quiet "uv>=0.9,<1"
+	$(BIN)/uv sync --frozen --compile-bytecode --extra dev --extra conformance --extra bench
+	$(BIN)/python -m console.warm
+	@touch $@
+
+up: $(STAMP)
+	@exec $(BIN)/garden up $(ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -m "not soak and not compose" $(ARGS)
+
+test-compose: $(STAMP)
+	$(BIN)/python -m pytest -m compose tests/compose -s $(ARGS)
+
+check: $(STAMP)
+	$(BIN)/ruff check $(FOLDERS)
+	$(BIN)/ruff format --check $(FOLDERS)
+	$(BIN)/mypy
+
+bench: $(STAMP)
+	$(BIN)/garden bench $(ARGS)
+
+reproduce: $(STAMP)
+	$(BIN)/python -m lab.reproduce $(ARGS)
+
+soak: $(STAMP)
+	$(BIN)/python -m pytest -m soak $(ARGS)
+
+docs: $(STAMP)
+	$(BIN)/mkdocs build --quiet
