@@ -7,6 +7,7 @@ import json
 import random
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,11 @@ from sim.devices.host import EmulatorHost
 
 SOIL_ML = 3000.0
 KEY = GardenKey.from_seed(1)
+
+
+@lru_cache
+def token(subject: str, role: str) -> str:
+    return KEY.issue(subject, role, 0.0).token
 
 
 @dataclass
@@ -262,7 +268,7 @@ class Garden:
     async def call(
         self, plant_id: str, method: str, path: str, *, who: str = "operator", role: str = "operator", **more: Any
     ) -> httpx.Response:
-        headers = {"authorization": f"Bearer {KEY.issue(who, role, 0.0).token}"} | more.pop("headers", {})
+        headers = {"authorization": f"Bearer {token(who, role)}"} | more.pop("headers", {})
         transport = httpx.ASGITransport(self.nodes[plant_id].app)
         async with httpx.AsyncClient(transport=transport, base_url=f"http://{plant_id}") as client:
             return await client.request(method, path, headers=headers, **more)
