@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import random
-import tty
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
@@ -16,10 +14,11 @@ from core.clock import WallClock
 from hw.drivers.firmata import FirmataBoard
 from hw.drivers.ssc32 import Ssc32Driver
 from hw.drivers.stargazer import StargazerDriver
-from hw.links import StreamLink, open_link
+from hw.links import open_link
 from sim.devices import bench_ssc32
 from sim.devices.bench_firmata import BenchPins
 from sim.devices.bench_stargazer import BenchCamera
+from sim.devices.emulate import PtyLink
 from sim.devices.firmata import FirmataEmulator
 from sim.devices.host import EmulatorHost
 from sim.devices.plants import Emulator
@@ -41,26 +40,13 @@ async def on_tcp(emulator: Emulator) -> AsyncIterator[str]:
 
 @contextlib.asynccontextmanager
 async def on_pty(emulator: Emulator) -> AsyncIterator[str]:
-    """Bridges a pseudo-terminal to the emulator's TCP port; gives the terminal's path."""
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    loop = asyncio.get_running_loop()
-    async with on_tcp(emulator) as url:
-        link = await open_link(url)
-        assert isinstance(link, StreamLink)
-        loop.add_reader(master, lambda: link.write(os.read(master, 4096)))
-
-        async def forward() -> None:
-            while True:
-                os.write(master, await link.read())
-
-        forwarding = asyncio.create_task(forward())
-        yield os.ttyname(slave)
-        forwarding.cancel()
-        loop.remove_reader(master)
-        await link.close()
-    os.close(slave)
-    os.close(master)
+    """Serves the emulator on a pseudo-terminal; gives its path."""
+    host, link = EmulatorHost(emulator, WallClock()), PtyLink()
+    host.attach(link)
+    running = asyncio.create_task(host.run())
+    yield link.path
+    running.cancel()
+    await host.close()
 
 
 async def until(condition: Callable[[], bool]) -> None:

@@ -4,45 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-import os
 import random
+import subprocess
+import sys
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from core.clock import WallClock
-from core.errors import LinkDown
 from sim.devices.bench_firmata import BenchPins
+from sim.devices.emulate import PtyLink
 from sim.devices.firmata import FirmataEmulator
 from sim.devices.host import EmulatorHost
 
 pyfirmata2 = pytest.importorskip("pyfirmata2", reason="pip install robot-garden[conformance]")
-
-
-class PtyLink:
-    """The device's end of a pseudo-terminal."""
-
-    name = "pty"
-
-    def __init__(self, master: int) -> None:
-        self.master = master
-        self.arrived: asyncio.Queue[bytes] = asyncio.Queue()
-        asyncio.get_running_loop().add_reader(master, lambda: self.arrived.put_nowait(os.read(master, 4096)))
-
-    async def read(self) -> bytes:
-        return await self.arrived.get()
-
-    def write(self, data: bytes) -> None:
-        if not data:
-            raise LinkDown("nothing to write")
-        os.write(self.master, data)
-
-    async def close(self) -> None:
-        asyncio.get_running_loop().remove_reader(self.master)
 
 
 class Arduino:
@@ -50,9 +29,7 @@ class Arduino:
 
     def __init__(self) -> None:
         self.pins = BenchPins(random.Random(1))
-        self.master, self.slave = os.openpty()
-        tty.setraw(self.slave)
-        self.path = os.ttyname(self.slave)
+        self.path = ""
         self._serving = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()))
         self._thread.start()
@@ -61,14 +38,13 @@ class Arduino:
     def end(self) -> None:
         self._loop.call_soon_threadsafe(self._ended.set)
         self._thread.join()
-        os.close(self.master)
-        os.close(self.slave)
 
     async def _serve(self) -> None:
-        self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
+        self._loop, self._ended, link = asyncio.get_running_loop(), asyncio.Event(), PtyLink()
+        self.path = link.path
         self._serving.set()
         host = EmulatorHost(FirmataEmulator(self.pins, random.Random(1)), WallClock())
-        host.attach(PtyLink(self.master))
+        host.attach(link)
         running = asyncio.create_task(host.run())
         await self._ended.wait()
         running.cancel()
@@ -125,3 +101,16 @@ def test_a_board_sets_itself_up_by_its_capabilities(arduino: Arduino) -> None:
         assert eventually(lambda: arduino.pins.levels.get(9, False))
     finally:
         client.exit()
+
+
+def test_the_emulate_command_is_a_board_too(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sim.devices.emulate", "firmata", "--pty", str(tmp_path / "ttyACM0")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            client: Any = pyfirmata2.Board(process.stdout.readline().strip())
+            assert len(client.digital) == 14
+            client.exit()
+        finally:
+            process.terminate()
+            assert process.wait(10.0) == 0
