@@ -201,7 +201,7 @@ def draw_setpoint(rng: random.Random) -> Setpoint:
     arm = rng.choice((None, gardener.ARM_HOME_RAD, OUT, (number(2.0), number(3.0), number(3.0), number(2.0))))
     return Setpoint(
         seq=0,
-        base=rng.choice(("stop", "drive", "drive", "seek_dock")),
+        base=rng.choice(("stop", "stop", "drive", "drive", "seek_dock")),
         v_mps=number(0.8),
         omega_radps=number(3.0),
         arm=arm,
@@ -209,7 +209,7 @@ def draw_setpoint(rng: random.Random) -> Setpoint:
         gripper_m=rng.choice((None, number(0.06))),
         pump=rng.random() < 0.5,
         permit_id=rng.choice(("", "p", "p")),
-        dose_ml=number(200.0),
+        dose_ml=number(200.0) if rng.random() < 0.3 else 50.0,
     )
 
 

@@ -2,7 +2,7 @@
 
 import math
 import random
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from core.allocation.right_of_way import RANK_DRIVING, RANK_IDLE, Other, in_the_way_of
 from core.estimation.odometry import arc
@@ -12,7 +12,7 @@ from core.robots.garden_map import GardenMap
 from robot_service.ground import Ground
 from robot_service.navigator import Navigator
 
-DT_S = 0.05
+DT_S = 0.08
 
 
 @dataclass
@@ -47,8 +47,6 @@ class Walker:
         )
 
     def others(self, now_s: float) -> list[Other]:
-        from dataclasses import replace
-
         return [replace(o, age_s=now_s - at) for at, o in self.heard.values()]
 
     def step(self, now_s: float, walkers: list["Walker"]) -> None:
@@ -56,7 +54,7 @@ class Walker:
         every_s = (0.5 if near else 1.0) if self.nav else 2.0
         if now_s - self.polled_s >= every_s and now_s >= self.phase_s:
             self.polled_s = now_s
-            self.heard |= {w.name: (now_s, w.word(now_s)) for w in walkers if w is not self and not w.silent}
+            self.heard |= {w.name: (now_s, w.word(now_s)) for w in walkers if w is not self and not (w.silent and w.name in self.heard)}
         if self.silent or now_s < self.phase_s:
             return
         others = self.others(now_s)

@@ -1,0 +1,333 @@
+"""What can happen on the way to a watered pot, on stand-ins and virtual time."""
+
+import pytest
+from standin import in_garden
+
+from core.geometry.planar import distance_m
+from core.robots import gardener
+from core.wire.market import ReservationRequest
+from core.wire.robot import JobRequest, StopRequest
+
+
+def poured(garden, plant, robot="robot-1"):
+    return sum(ml for dock, ml in garden.bodies[robot].poured_at if dock == plant)
+
+
+def test_an_awarded_watering_is_driven_docked_poured_and_reported():
+    async def story(garden):
+        bid = await garden.bid("plant-1")
+        began_s = garden.clock.now()
+        assert (await garden.award("plant-1")).status_code == 201
+        plant = garden.plants["plant-1"]
+        await garden.until(lambda: plant.ended, 120.0)
+        took_s = garden.clock.now() - began_s
+        assert plant.ended.state == "done"
+        assert plant.ended.delivered_ml == pytest.approx(150.0, abs=0.5)
+        assert poured(garden, "plant-1") == pytest.approx(150.0, abs=0.5)
+        assert bid.cost_s == pytest.approx(took_s, rel=0.5)
+        phases = [r.phase.partition(":")[0] for r in plant.reports]
+        assert [p for p in ("navigate", "dock", "act") if p in phases] == ["navigate", "dock", "act"]
+
+    in_garden(story)
+
+
+@pytest.mark.parametrize("how", ["beam", "seek-dock"])
+def test_either_way_of_docking_ends_with_charge_current_at_the_far_pot(how):
+    async def story(garden):
+        await garden.award("plant-3")
+        await garden.until(lambda: garden.plants["plant-3"].ended, 150.0)
+        assert garden.plants["plant-3"].ended.state == "done"
+
+    in_garden(story, seed=2, docking=how)
+
+
+def test_the_papers_filter_drives_it_too():
+    async def story(garden):
+        await garden.award("plant-4")
+        await garden.until(lambda: garden.plants["plant-4"].ended, 150.0)
+        assert garden.plants["plant-4"].ended.state == "done"
+
+    in_garden(story, seed=3, localisation="exponential")
+
+
+def test_two_awards_are_done_one_after_the_other_and_both_leases_are_kept():
+    async def story(garden):
+        await garden.award("plant-1")
+        await garden.award("plant-2")
+        first, second = garden.plants["plant-1"], garden.plants["plant-2"]
+        await garden.until(lambda: second.ended, 200.0)
+        assert first.ended.state == second.ended.state == "done"
+        assert second.reports[0].state == "awarded"
+
+    in_garden(story)
+
+
+def test_a_task_killed_on_the_way_is_dropped_and_the_robot_goes_home_without_pouring():
+    async def story(garden):
+        await garden.award("plant-3")
+        robot = garden.brains["robot-1"].robot
+        await garden.until(lambda: robot.activity.v_mps > 0.2, 20.0)
+        answer = await garden.call("robot-1", "DELETE", "/tasks/plant-3:1", as_="plant-3")
+        assert answer.status_code == 200
+        await garden.until(lambda: not garden.brains["robot-1"].queue.entries, 2.0)
+        home = (0.0, 1.20)
+        await garden.until(lambda: distance_m(garden.bodies["robot-1"].pose, home) < 0.2 and not robot.moving, 60.0)
+        assert poured(garden, "plant-3") == 0.0
+        assert garden.plants["plant-3"].docks.loan("plant-3", garden.clock.now()).robot_id == ""
+
+    in_garden(story)
+
+
+def test_a_task_killed_at_the_dock_before_the_permit_undocks():
+    async def story(garden):
+        await garden.award("plant-1")
+        plant = garden.plants["plant-1"]
+        await garden.until(lambda: garden.bodies["robot-1"].docked, 80.0)
+        await garden.call("robot-1", "DELETE", "/tasks/plant-1:1", as_="plant-1")
+        await garden.until(lambda: not garden.bodies["robot-1"].dock, 20.0)
+        await garden.until(lambda: not plant.docks.loan("plant-1", garden.clock.now()).robot_id, 30.0)
+        assert poured(garden, "plant-1") == 0.0
+
+    in_garden(story)
+
+
+def test_a_task_killed_while_pouring_is_finished_and_reported_honestly():
+    async def story(garden):
+        await garden.award("plant-1")
+        await garden.until(lambda: garden.bodies["robot-1"].pumping, 80.0)
+        await garden.call("robot-1", "DELETE", "/tasks/plant-1:1", as_="plant-1")
+        plant = garden.plants["plant-1"]
+        await garden.until(lambda: plant.ended, 60.0)
+        assert plant.ended.state == "done"
+        assert plant.ended.delivered_ml == pytest.approx(poured(garden, "plant-1"), abs=0.5)
+        assert poured(garden, "plant-1") == pytest.approx(150.0, abs=0.5)
+
+    in_garden(story)
+
+
+def test_a_plant_that_answers_keep_false_loses_the_robot():
+    async def story(garden):
+        await garden.award("plant-3")
+        await garden.until(lambda: garden.brains["robot-1"].robot.activity.v_mps > 0.2, 20.0)
+        garden.plants["plant-3"].keep = False
+        await garden.until(lambda: not garden.brains["robot-1"].queue.entries, 6.0)
+        assert poured(garden, "plant-3") == 0.0
+
+    in_garden(story)
+
+
+def test_a_plant_that_fell_silent_loses_the_robot_when_the_lease_ends():
+    async def story(garden):
+        await garden.award("plant-3")
+        await garden.until(lambda: garden.plants["plant-3"].reports, 5.0)
+        garden.plants["plant-3"].silent = True
+        await garden.until(lambda: not garden.brains["robot-1"].queue.entries, 14.0)
+
+    in_garden(story)
+
+
+def test_a_refused_permit_pours_nothing_and_says_why():
+    async def story(garden):
+        garden.plants["plant-1"].refuse_permit = "measure first"
+        await garden.award("plant-1")
+        plant = garden.plants["plant-1"]
+        await garden.until(lambda: plant.ended, 100.0)
+        assert plant.ended.state == "failed"
+        assert "measure first" in plant.ended.reason
+        assert poured(garden, "plant-1") == 0.0
+
+    in_garden(story)
+
+
+def test_a_held_dock_is_waited_for_at_a_distance_with_the_reason():
+    async def story(garden):
+        plant, robot = garden.plants["plant-1"], garden.brains["robot-1"]
+        held = plant.docks.reserve(ReservationRequest(robot_id="robot-9", for_s=600.0), garden.clock.now())
+        await garden.award("plant-1")
+        await garden.until(lambda: "robot-9" in robot.state().waiting, 60.0)
+        await garden.clock.sleep(10.0)
+        dock = plant.card.dock
+        assert distance_m(garden.bodies["robot-1"].pose, (dock.x_m, dock.y_m)) > 0.9
+        plant.docks.release(held.reservation_id, "")
+        await garden.until(lambda: plant.ended, 120.0)
+        assert plant.ended.state == "done"
+
+    in_garden(story)
+
+
+def test_a_robot_that_rests_on_a_dock_leaves_when_somebody_wants_it():
+    async def story(garden):
+        await garden.award("plant-1")
+        plant = garden.plants["plant-1"]
+        await garden.until(lambda: plant.ended, 120.0)
+        await garden.until(lambda: plant.docks.loan("plant-1", garden.clock.now()).yielding, 15.0)
+        wish = ReservationRequest(robot_id="robot-9", for_s=30.0)
+
+        def granted():
+            try:
+                return plant.docks.reserve(wish, garden.clock.now())
+            except Exception:
+                return None
+
+        await garden.until(granted, 40.0)
+        assert not garden.bodies["robot-1"].dock
+
+    in_garden(story)
+
+
+def test_an_unmapped_obstacle_is_bumped_backed_off_from_and_driven_round():
+    async def story(garden):
+        garden.plane.hidden.append((0.0, 0.5, 0.05))
+        await garden.call("robot-1", "POST", "/jobs", JobRequest(kind="goto", x_m=0.0, y_m=0.0, yaw_rad=0.0))
+        await garden.until(lambda: distance_m(garden.bodies["robot-1"].pose, (0.0, 0.0)) < 0.05, 120.0)
+        assert any(e.kind == "bump" for e in garden.brains["robot-1"].events.since(0))
+
+    in_garden(story)
+
+
+def test_a_neighbouring_pot_that_attracts_the_docking_robot_is_noticed():
+    async def story(garden):
+        body, plant = garden.bodies["robot-1"], garden.plants["plant-1"]
+        await garden.award("plant-1")
+        await garden.until(lambda: garden.brains["robot-1"].robot.activity.job == "dock", 80.0)
+        body.attracted_to = "plant-3"
+        await garden.until(lambda: any(e.kind == "dock" for e in garden.brains["robot-1"].events.since(0)), 90.0)
+        body.attracted_to = ""
+        await garden.until(lambda: plant.ended, 150.0)
+        assert plant.ended.state == "done"
+        assert poured(garden, "plant-3") == 0.0
+
+    in_garden(story)
+
+
+def test_a_robot_with_too_little_water_prices_and_does_the_refill_first():
+    async def story(garden):
+        full = await garden.bid("plant-1")
+        garden.bodies["robot-1"].tank_ml = 60.0
+        await garden.clock.sleep(1.0)
+        bid = await garden.bid("plant-1")
+        assert bid.breakdown.refill_s > 30.0
+        assert bid.cost_s > full.cost_s + 30.0
+        await garden.award("plant-1")
+        plant = garden.plants["plant-1"]
+        await garden.until(lambda: plant.ended, 300.0)
+        assert plant.ended.state == "done"
+        assert garden.station.taps >= 1
+        assert garden.bodies["robot-1"].tank_ml > 1200.0
+        assert garden.station.docks.loan("tap", garden.clock.now()).robot_id == ""
+
+    in_garden(story)
+
+
+def test_a_robot_low_on_charge_looks_for_a_dock_by_itself_and_still_answers_bids():
+    async def story(garden):
+        garden.bodies["robot-1"].battery_ratio = 0.2
+        await garden.until(lambda: garden.bodies["robot-1"].docked, 120.0)
+        assert garden.brains["robot-1"].robot.activity.job == "charge"
+        bid = await garden.bid("plant-1")
+        assert bid.cost_s is not None
+
+    in_garden(story)
+
+
+def test_the_e_stop_halts_the_wheels_latches_and_gives_the_task_back():
+    async def story(garden):
+        await garden.award("plant-3")
+        body = garden.bodies["robot-1"]
+        await garden.until(lambda: body.v > 0.2, 20.0)
+        answer = await garden.call("robot-1", "POST", "/stop", StopRequest(reason="cat"), as_="viewer")
+        assert answer.status_code == 200
+        assert answer.json()["stopped"]
+        assert body.v == 0.0
+        plant = garden.plants["plant-3"]
+        await garden.until(lambda: plant.ended, 5.0)
+        assert "stopped by viewer: cat" in plant.ended.reason
+        assert (await garden.bid("plant-3")).reason.startswith("stopped by")
+        assert (await garden.call("robot-1", "POST", "/resume", as_="viewer")).status_code == 403
+        assert body.stopped
+        assert (await garden.call("robot-1", "POST", "/resume", as_="operator")).json()["stopped"] is False
+        await garden.award("plant-3", number=2)
+        await garden.until(lambda: plant.reports[-1].state == "done", 150.0)
+
+    in_garden(story)
+
+
+@pytest.mark.parametrize("when", ["drive", "dock", "pour"])
+def test_a_brain_killed_in_the_act_stops_and_comes_back_with_an_empty_queue(when):
+    async def story(garden):
+        await garden.award("plant-1")
+        body, robot = garden.bodies["robot-1"], garden.brains["robot-1"].robot
+        moments = {
+            "drive": lambda: body.v > 0.2,
+            "dock": lambda: robot.activity.job == "dock" and body.v > 0.0,
+            "pour": lambda: body.pumping,
+        }
+        await garden.until(moments[when], 90.0)
+        await garden.kill("robot-1")
+        await garden.clock.sleep(0.35)
+        assert body.v == 0.0
+        assert not body.pumping
+        plant = garden.plants["plant-1"]
+        plant.reports.clear()
+        brain = garden.boot("robot-1")
+        await garden.clock.sleep(15.0)
+        assert not brain.queue.entries
+        assert not plant.reports
+        await garden.award("plant-2", number=3)
+        await garden.until(lambda: garden.plants["plant-2"].ended, 200.0)
+        assert garden.plants["plant-2"].ended.state == "done"
+        assert poured(garden, "plant-1") <= 150.5
+
+    in_garden(story)
+
+
+def test_a_stuck_pump_is_reported_with_what_came_out():
+    async def story(garden):
+        await garden.award("plant-1")
+        body = garden.bodies["robot-1"]
+        await garden.until(lambda: body.pumped_ml > 50.0, 90.0)
+        body.pump_stuck = True
+        plant = garden.plants["plant-1"]
+        await garden.until(lambda: plant.ended, 60.0)
+        assert plant.ended.state == "failed"
+        assert plant.ended.delivered_ml == pytest.approx(poured(garden, "plant-1"), abs=0.5)
+        assert "pump" in plant.ended.reason
+
+    in_garden(story)
+
+
+def test_a_blind_robot_stops_looks_around_and_says_that_it_is_lost():
+    async def story(garden):
+        await garden.award("plant-3")
+        body, brain = garden.bodies["robot-1"], garden.brains["robot-1"]
+        await garden.until(lambda: body.v > 0.2, 20.0)
+        body.blind = True
+        await garden.until(lambda: "lost" in brain.state().waiting, 40.0)
+        body.blind = False
+        await garden.until(lambda: garden.plants["plant-3"].ended, 200.0)
+        assert garden.plants["plant-3"].ended.state == "done"
+
+    in_garden(story, seed=5)
+
+
+def test_an_idle_robot_at_home_sends_nothing_and_its_body_rests():
+    async def story(garden):
+        await garden.clock.sleep(10.0)
+        body, link = garden.bodies["robot-1"], garden.brains["robot-1"].body
+        sent, states = link.sent, body.states
+        await garden.clock.sleep(20.0)
+        assert link.sent - sent <= 12
+        assert body.states - states <= 50
+
+    in_garden(story)
+
+
+def test_two_robots_water_four_pots_and_never_touch():
+    async def story(garden):
+        for plant, robot in (("plant-1", "robot-2"), ("plant-3", "robot-1"), ("plant-2", "robot-2"), ("plant-4", "robot-1")):
+            await garden.award(plant, robot)
+        await garden.until(lambda: all(p.ended for p in garden.plants.values()), 500.0)
+        assert [p.ended.state for p in garden.plants.values()] == ["done"] * 4
+        assert garden.plane.closest_m > 2 * gardener.BODY_RADIUS_M + 0.02
+
+    in_garden(story, robots=2)
