@@ -5,6 +5,7 @@ World frame as in `core.scenario`. Time is garden seconds from the scenario's `s
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mujoco
@@ -50,6 +51,7 @@ class World:
         }
         litres = scenario.climate.litres_per_day
         self.pots = {p.id: Pot(p, litres, scene.shrubs[p.id], generator(seed, f"probe/{p.id}")) for p in scenario.plants}
+        self._fruit = {name: _fruit_of(pot) for name, pot in self.pots.items()}
         self.docks = [beams.Dock(name, pose) for name, pose in scenario.docks().items()]
         station = scenario.station
         self.tap_board = TapBoard(tuple(f"{station.id}/{dock.id}" for dock in station.docks if dock.tap))
@@ -226,21 +228,6 @@ class World:
 
     def _plant_truth(self, pot: Pot) -> PlantTruth:
         soil = pot.soil
-        stem = Planar(pot.plant.x_m, pot.plant.y_m, np.radians(pot.plant.dock_yaw_deg))
-        fruit = []
-        for berry in pot.shrub.berries:
-            x, y, z = berry.centre
-            wx, wy = stem.point(x, y)
-            fruit.append(
-                FruitTruth(
-                    id=berry.fruit_id,
-                    position_plant=Point3(x_m=x, y_m=y, z_m=z),
-                    position_world=Point3(x_m=wx, y_m=wy, z_m=z + g.SOIL_HEIGHT_M),
-                    radius_m=berry.radius_m,
-                    colour=berry.colour,
-                    ripeness=berry.ripeness,
-                )
-            )
         return PlantTruth(
             id=pot.id,
             moisture_ratio=soil.moisture_ratio,
@@ -248,5 +235,25 @@ class World:
             poured_ml=soil.poured_ml,
             given_off_ml=soil.given_off_ml,
             drained_ml=soil.drained_ml,
-            fruit=tuple(fruit),
+            fruit=self._fruit[pot.id],
         )
+
+
+def _fruit_of(pot: Pot) -> tuple[FruitTruth, ...]:
+    """Fixed as yet, so told once."""
+    stem = Planar(pot.plant.x_m, pot.plant.y_m, math.radians(pot.plant.dock_yaw_deg))
+    told = []
+    for berry in pot.shrub.berries:
+        x_m, y_m, z_m = berry.centre
+        x_world_m, y_world_m = stem.point(x_m, y_m)
+        told.append(
+            FruitTruth(
+                id=berry.fruit_id,
+                position_plant=Point3(x_m=x_m, y_m=y_m, z_m=z_m),
+                position_world=Point3(x_m=x_world_m, y_m=y_world_m, z_m=z_m + g.SOIL_HEIGHT_M),
+                radius_m=berry.radius_m,
+                colour=berry.colour,
+                ripeness=berry.ripeness,
+            )
+        )
+    return tuple(told)
