@@ -81,7 +81,7 @@ class Runner:
                 sys.executable,
                 "-m",
                 child.process.module,
-                env=environment(child.process),
+                env=environment(child.process) | ({"SIM_FRESH": "false"} if child.deaths else {}),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

@@ -7,6 +7,7 @@ world that ended badly goes on from there. Its soil and batteries live through t
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from sim.world import World
 SCHEMA = 1
 EVERY_S = 2.0
 RESERVE_S = 3 * EVERY_S
+DAY_S = 86400.0
 _log = structlog.get_logger("garden.sim")
 
 
@@ -48,10 +50,18 @@ class Keeper:
             return False
         return True
 
+    def begin_anew(self) -> None:
+        """A new world on a later day at the same hour: other services remember times that must not come again."""
+        try:
+            reserved_s = _finite(json.loads(self.path.read_bytes())["reserved_s"])
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return
+        self._world.time_s = DAY_S * math.ceil(reserved_s / DAY_S)
+
     def _put_back(self, document: dict[str, Any]) -> None:
         if document["schema"] != SCHEMA:
             raise ValueError(f"schema {document['schema']}, not {SCHEMA}")
-        before = self._world.snapshot()
+        reserved_s, before = _finite(document["reserved_s"]), self._world.snapshot()
         try:
             self._world.restore(document["world"])
             self._faults.restore(document["faults"])
@@ -59,7 +69,7 @@ class Keeper:
             self._world.restore(before)
             self._faults.restore([])
             raise
-        self._world.stride(max(0.0, float(document["reserved_s"]) - self._world.time_s))
+        self._world.stride(max(0.0, reserved_s - self._world.time_s))
 
     def document(self, reserve_s: float = 0.0) -> dict[str, Any]:
         """What a checkpoint holds."""
@@ -95,6 +105,12 @@ def write_whole(path: Path, document: dict[str, Any]) -> None:
         temporary.replace(path)
     except OSError as error:
         raise StorageError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _finite(value: object) -> float:
+    if not isinstance(value, float | int) or not math.isfinite(value):
+        raise ValueError(f"{value!r} is not a time")
+    return float(value)
 
 
 def _set_aside(path: Path) -> Path:

@@ -81,7 +81,9 @@ async def build(runtime: Runtime) -> Node:
     loops: list[Loop] = []
     if settings.data is not None:
         keeper = Keeper(settings.data, rig.world, rig.faults, rig.clockwork)
-        if not settings.fresh and keeper.restore():
+        if settings.fresh:
+            keeper.begin_anew()
+        elif keeper.restore():
             power_up(rig.world)
         loops.append(lambda: keeper.run(runtime.clock))
     return make_node(

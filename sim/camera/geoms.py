@@ -14,8 +14,8 @@ Ints = npt.NDArray[np.int32]
 VISIBLE_GROUPS = (0, 1, 2)
 """Geoms of other groups are collision hulls and helpers."""
 
-PLAIN, ASTROTURF, SOIL, LEAF = 0, 1, 2, 3
-_TEXTURES = {"turf": ASTROTURF, "/soil": SOIL, "/leaf/": LEAF}
+PLAIN, ASTROTURF, SOIL, LEAF, LAMP = range(5)
+_TEXTURES = {"turf": ASTROTURF, "/soil": SOIL, "/leaf/": LEAF, "lamp-": LAMP}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +25,7 @@ class Paint:
     rgba: Floats
     """(N, 4), linear 0-1."""
     texture: Ints
-    """(N,), one of PLAIN, ASTROTURF, SOIL, LEAF."""
+    """(N,), one of PLAIN, ASTROTURF, SOIL, LEAF, LAMP."""
     gloss: Floats
     """(N,), strength of the highlight 0-1."""
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sim.camera.camera import Camera, directions, from_fov, look_at
-from sim.camera.geoms import ASTROTURF, LEAF, SOIL, Floats, Geoms, Ints, Paint
+from sim.camera.geoms import ASTROTURF, LAMP, LEAF, SOIL, Floats, Geoms, Ints, Paint
 from sim.camera.raster import Raster, rasterise
 
 Picture = npt.NDArray[np.uint8]
@@ -244,6 +244,8 @@ def _paint(
             # Light from above is a little stronger than light from below.
             for i in range(3):
                 light[i], light[3 + i] = ambient_rgb[i] * (0.8 + 0.2 * n[2]), 0.0
+            if textures[g] == LAMP:
+                light[0] = light[1] = light[2] = 1.0
             leaf = textures[g] == LEAF
             for lamp in range(len(lamps_m)):
                 lit = _lit(p, lens, T_world_lamp, depths) if lamp == 0 else 1.0

@@ -86,6 +86,7 @@ def test_without_a_checkpoint_the_world_begins(tmp_path: Path) -> None:
         lambda text: b"[]",
         lambda text: json.dumps(json.loads(text) | {"schema": 99}).encode(),
         lambda text: json.dumps(json.loads(text) | {"faults": [{"kind": "x"}]}).encode(),
+        lambda text: json.dumps(json.loads(text) | {"reserved_s": float("inf")}).encode(),
         lambda text: json.dumps(json.loads(text) | {"world": {"version": 1}}).encode(),
     ],
 )
@@ -105,3 +106,14 @@ def test_the_checkpoint_of_another_seed_is_not_taken(tmp_path: Path) -> None:
     _, keeper = garden(tmp_path, seed=8)
     write_whole(keeper.path, keeper.document())
     assert not garden(tmp_path, seed=7)[1].restore()
+
+
+def test_a_world_begun_anew_is_new_but_its_time_does_not_go_back(tmp_path: Path) -> None:
+    rig, keeper = garden(tmp_path)
+    rig.world.stride(90_000.0)
+    write_whole(keeper.path, keeper.document())
+    later, again = garden(tmp_path)
+    again.begin_anew()
+    assert later.world.time_s == 2 * 86400.0
+    assert later.world.hour == rig.world.scenario.climate.start_hour
+    assert later.world.truth().plants == garden(tmp_path)[0].world.truth().plants
