@@ -22,9 +22,10 @@ COPY robot_service robot_service
 COPY console console
 COPY lab lab
 COPY scenarios scenarios
-RUN uv sync --frozen --no-editable \
-    && mkdir -p /opt/numba \
-    && cd / && /opt/garden/bin/python -m console.warm \
+RUN uv sync --frozen --no-editable
+WORKDIR /
+RUN mkdir -p /opt/numba \
+    && /opt/garden/bin/python -m console.warm \
     && find /opt/garden -name tests -path "*/site-packages/*" -type d -prune -exec rm -r {} + \
     && chmod -R a+rwX /opt/numba
 
@@ -42,5 +43,5 @@ ENV PATH=/opt/garden/bin:$PATH \
     OPENBLAS_NUM_THREADS=1 \
     PYTHONUNBUFFERED=1
 WORKDIR /data
-USER garden
+USER 10001:10001
 CMD ["garden", "--help"]

@@ -238,9 +238,9 @@ def home(robot: Robot, wait: Wait = False, data: Data = DATA, as_json: Json = Fa
 @app.command()
 def doctor(data: Data = DATA, as_json: Json = False) -> None:
     """Look for what is missing or in the way."""
-    from console import doctor as doctoring
+    from console.doctor import doctor as look
 
-    doctoring.doctor(data, as_json)
+    look(data, as_json)
 
 
 @app.command()
@@ -249,9 +249,9 @@ def compose(
     as_json: Json = False,
 ) -> None:
     """Print the docker-compose.yml of a scenario."""
-    from console import compose as composing
+    from console.compose import compose as write
 
-    composing.compose(scenario, as_json)
+    write(scenario, as_json)
 
 
 @app.command()
