@@ -32,8 +32,10 @@ BACK_M = 0.22
 FLEE_M = 0.15
 ROAM_MPS = 0.18
 ROAM_M = 0.45
-ONE_SIDED_RAD = math.radians(150.0)
-"""After so much turning towards the other colour the robot drives on straight instead."""
+TIGHT_RAD = math.radians(130.0)
+"""Having turned so far without finding the other colour, the robot widens its arc to a spiral."""
+RUN_IN_M = 0.25
+"""Coming from a search, drive into the beam before turning in it."""
 BLIND_S = 0.6
 """Without any beam for so long, the line is lost."""
 
@@ -64,6 +66,7 @@ class DockSeeker:
     _mark_yaw_rad: float = 0.0
     _turn: float = 1.0
     _goal: float = 0.0
+    _run_in_m: float = 0.0
     _after_back: Phase = Phase.FOLLOW
 
     @property
@@ -137,20 +140,18 @@ class DockSeeker:
         self._seen_s = self._now_s
         if sense.ir_red and sense.ir_green:
             self._mark()
+            self._run_in_m = 0.0
             return (NEAR_MPS if sense.ir_field else FAR_MPS), 0.0
         on_left = sense.ir_red is (self.red_side == "left")
         self._turn = -1.0 if on_left else 1.0
-        if abs(self._turned_rad) > ONE_SIDED_RAD:
-            return self._cross()
+        if self._driven_m < self._run_in_m:
+            return ARC_MPS, 0.0
+        turned = abs(self._turned_rad) / TIGHT_RAD
+        if turned > 1.0:
+            return FAR_MPS, self._turn * ARC_RADPS / turned**2
         if sense.ir_field:
             return PIVOT_MPS, self._turn * PIVOT_RADPS
         return ARC_MPS, self._turn * ARC_RADPS
-
-    def _cross(self) -> tuple[float, float]:
-        """Turning did not find the other colour: it is farther than the receiver reaches."""
-        if self._driven_m > ROAM_M:
-            self._mark()
-        return ARC_MPS, 0.0
 
     def _blind(self) -> tuple[float, float]:
         """Neither colour: keep turning to where the line was, then look round."""
@@ -158,9 +159,13 @@ class DockSeeker:
             self._enter(Phase.SPIN)
         return 0.0, self._turn * PIVOT_RADPS
 
+    def _found(self) -> None:
+        self._enter(Phase.FOLLOW)
+        self._run_in_m = RUN_IN_M
+
     def _spin(self, sense: CreateSense) -> tuple[float, float]:
         if sense.ir_red or sense.ir_green:
-            self._enter(Phase.FOLLOW)
+            self._found()
         elif abs(self._turned_rad) > 2.0 * math.pi:
             self._goal = self.rng.uniform(0.3, 1.2) * math.pi
             self._enter(Phase.TURN)
@@ -168,7 +173,7 @@ class DockSeeker:
 
     def _roam(self, sense: CreateSense) -> tuple[float, float]:
         if sense.ir_red or sense.ir_green:
-            self._enter(Phase.FOLLOW)
+            self._found()
         elif self._driven_m > ROAM_M:
             self._enter(Phase.SPIN)
         return ROAM_MPS, 0.0
