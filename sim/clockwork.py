@@ -16,7 +16,8 @@ from typing import Protocol
 from core.clock import Clock
 
 TICK_S = 0.02
-STRIDE_S_MAX = 0.5
+STRIDE_S_MAX = 5.0
+"""A resting world is brought to the present whenever it is looked at, so long strides hide nothing."""
 STRIDE_S_MIN = 0.001
 FORGIVEN_S = 0.15
 """Wall seconds the world may lag and still catch up; beyond it, garden time slows."""
