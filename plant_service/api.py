@@ -74,7 +74,7 @@ def add_station(app: FastAPI, station: Station) -> None:
         return station.dock_states()
 
     @app.post("/tap", tags=["station"], summary="Open the tap for a while")
-    async def tap(request: TapRequest = body(TapRequest), caller: Caller = allow("robot")) -> TapGrant:
+    async def tap(caller: Caller = allow("robot"), request: TapRequest = body(TapRequest)) -> TapGrant:
         speaks_for(caller, request.robot_id)
         return await station.tap(request)
 
@@ -88,7 +88,7 @@ def _state_routes(app: FastAPI, pot: Pot) -> None:
         return pot.state()
 
     @app.patch("/settings", tags=["plant"], summary="Change thresholds, dose, caps")
-    async def settings(patch: SettingsPatch = body(SettingsPatch), caller: Caller = allow("operator")) -> Settings:
+    async def settings(caller: Caller = allow("operator"), patch: SettingsPatch = body(SettingsPatch)) -> Settings:
         return await pot.set_care(patch, caller.subject)
 
 
@@ -101,7 +101,7 @@ def _inventory_routes(app: FastAPI, pot: Pot) -> None:
 
     @app.post("/inventory/fruits", tags=["inventory"], summary="Add one fruit", status_code=201)
     async def add(
-        response: Response, fruit: NewFruit = body(NewFruit), caller: Caller = allow("robot", "operator")
+        response: Response, caller: Caller = allow("robot", "operator"), fruit: NewFruit = body(NewFruit)
     ) -> Fruit:
         added, now = await pot.shelf.add(fruit)
         response.headers["location"] = f"/inventory/fruits/{added.fruit_id}"
@@ -109,7 +109,7 @@ def _inventory_routes(app: FastAPI, pot: Pot) -> None:
         return added
 
     @app.post("/inventory/scans", tags=["inventory"], summary="Merge what a scan saw")
-    async def scan(response: Response, seen: Scan = body(Scan), caller: Caller = allow("robot", "operator")) -> Inventory:
+    async def scan(response: Response, caller: Caller = allow("robot", "operator"), seen: Scan = body(Scan)) -> Inventory:
         merged = await pot.shelf.merge(seen)
         response.headers["etag"] = etag(merged)
         return merged
@@ -130,7 +130,7 @@ def _task_routes(app: FastAPI, pot: Pot) -> None:
         return pot.place.market.tasks()
 
     @app.post("/tasks", tags=["tasks"], summary="Ask for water", status_code=201)
-    async def ask(response: Response, request: TaskRequest = body(TaskRequest), caller: Caller = allow("operator")) -> Task:
+    async def ask(response: Response, caller: Caller = allow("operator"), request: TaskRequest = body(TaskRequest)) -> Task:
         task = await pot.water(request.dose_ml, request.priority, caller.subject)
         response.headers["location"] = f"/tasks/{task.task_id}"
         return task
@@ -146,16 +146,16 @@ def _task_routes(app: FastAPI, pot: Pot) -> None:
 
 def _robot_routes(app: FastAPI, pot: Pot) -> None:
     @app.post("/tasks/{task_id}/reports", tags=["tasks"], summary="A robot's progress; renews its lease")
-    async def report(task_id: Id, told: Report = body(Report), caller: Caller = allow("robot")) -> ReportAnswer:
+    async def report(task_id: Id, caller: Caller = allow("robot"), told: Report = body(Report)) -> ReportAnswer:
         speaks_for(caller, told.robot_id)
         return await pot.place.change(lambda m, now_s: m.report(task_id, told, now_s))
 
     @app.post("/tasks/{task_id}/permits", tags=["tasks"], summary="A one-shot permit for the irreversible act")
     async def permit(
         task_id: Id,
+        caller: Caller = allow("robot"),
         request: PermitRequest = body(PermitRequest),
         idempotency_key: IdempotencyKey = "",
-        caller: Caller = allow("robot"),
     ) -> Permit:
         speaks_for(caller, request.robot_id)
         return await pot.place.change(lambda m, now_s: m.permit(task_id, request, idempotency_key, now_s))
@@ -172,7 +172,7 @@ def _dock_routes(app: FastAPI, pot: Pot) -> None:
 def _reservation_routes(app: FastAPI, owner: Pot | Station) -> None:
     @app.post("/dock/reservations", tags=["docks"], summary="Reserve a dock, or renew")
     async def reserve(
-        request: ReservationRequest = body(ReservationRequest), caller: Caller = allow("robot")
+        caller: Caller = allow("robot"), request: ReservationRequest = body(ReservationRequest)
     ) -> Reservation:
         speaks_for(caller, request.robot_id)
         return await owner.reserve(request)

@@ -28,7 +28,7 @@ SOAK_PROBE_S = 2.0
 """How often to look while a dose soaks in."""
 KEEP_READING_S = 60.0
 """The history gets one soil reading this often, and every change of state."""
-THIRST_AGAIN_S = 120.0
+THIRST_AGAIN_S = 1800.0
 """After a watering failed, wait this long before asking anew."""
 _WHY = {
     ProbeState.GOOD: "",
