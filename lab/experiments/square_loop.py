@@ -198,6 +198,4 @@ def _judge(seed: int, trials: int, blind: list[Drive], seeing: list[Drive]) -> R
         ("improvement", ">=", 10.0),
     )
     paper = {"odometry_drift_ratio": 0.10, "marker_error_m": "no accumulated error over 20 loops"}
-    return Result(
-        name="square-loop", seed=seed, trials=trials, paper=paper, ours=ours, bars=held(ours, *promises)
-    )
+    return Result(name="square-loop", seed=seed, trials=trials, paper=paper, ours=ours, bars=held(ours, *promises))
