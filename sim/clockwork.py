@@ -177,7 +177,7 @@ class Clockwork:
             self.ticks += 1
         now_s = self._world.time_s
         for host in self._hosts:
-            if not resting or host.due_s() <= now_s + 1e-9:
+            if host.due_s() <= now_s + 1e-9:
                 host.pump(now_s)
 
     def _stride_s(self) -> float:
