@@ -79,11 +79,11 @@ def _sized(space: CSpace, name: str, n: int) -> list[dict[str, Any]]:
     if (mcp := _mcp(space, goal_cell)) is not None:
         runs["mcp"] = mcp
     ms = _interleaved(runs, n)
-    rows = [_row(f"field/{name}", ms["ours"], ms["floor"], ms["ours"] / ms["floor"], "ms", n)]
+    rows = [_row(f"field/{name}", ms["ours"], ms["floor"], ms["ours"] / ms["floor"], "ms", n, most=FLOOR_RATIO_MAX)]
     if mcp is None:
         missing = {"missing": "scikit-image is not installed (extra bench)"}
         return [*rows, _row(f"mcp/{name}", ms["ours"], None, None, "ms", n) | missing]
-    rows.append(_row(f"mcp/{name}", ms["ours"], ms["mcp"], ms["mcp"] / ms["ours"], "ms", n))
+    rows.append(_row(f"mcp/{name}", ms["ours"], ms["mcp"], ms["mcp"] / ms["ours"], "ms", n, least=PEER_RATIO_MIN))
     return [*rows, _lengths(space, goal, mcp(), f"length/{name}")]
 
 
@@ -128,8 +128,23 @@ def _lengths(space: CSpace, goal: tuple[float, float], mcp: Any, name: str) -> d
         theirs = path_length_m(np.array(mcp.traceback(divmod(int(start), space.width)), float)) * space.grid.cell_m
         if path.length_m / theirs > worst:
             worst, ours_m, theirs_m = path.length_m / theirs, path.length_m, theirs
-    return _row(name, ours_m, theirs_m, worst, "m", 10)
+    return _row(name, ours_m, theirs_m, worst, "m", 10, most=LENGTH_RATIO_MAX)
 
 
-def _row(name: str, ours: float, peer: float | None, ratio: float | None, unit: str, n: int) -> dict[str, Any]:
-    return {"name": f"wavefront/{name}", "ours": ours, "peer": peer, "ratio": ratio, "unit": unit, "n": n}
+def _row(
+    name: str,
+    ours: float,
+    peer: float | None,
+    ratio: float | None,
+    unit: str,
+    n: int,
+    *,
+    most: float | None = None,
+    least: float | None = None,
+) -> dict[str, Any]:
+    row: dict[str, Any] = {"name": f"wavefront/{name}", "ours": ours, "peer": peer, "ratio": ratio, "unit": unit, "n": n}
+    if ratio is not None and most is not None:
+        row |= {"target": f"ratio <= {most:g}", "ok": ratio <= most}
+    if ratio is not None and least is not None:
+        row |= {"target": f"ratio >= {least:g}", "ok": ratio >= least}
+    return row
