@@ -14,6 +14,7 @@ from core.allocation.right_of_way import (
     Other,
     goes_first,
     in_the_way_of,
+    route_gap_m,
     speed_limit_mps,
 )
 from core.geometry.planar import Point, Pose, distance_m
@@ -33,7 +34,7 @@ RETREAT_S = 20.0
 REFUGE_REST_S = 3.0
 STUCK_S = 180.0
 CREEP_MPS = 0.02
-HOLD_M = 1.0
+ZONE_M = 0.75
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +58,9 @@ class Navigator:
     rank: int = RANK_DRIVING
     yaw_matters: bool = True
     may_enter: Callable[[], str] = field(default=lambda: "")
-    """Why the last HOLD_M before the goal may not be entered yet; empty when they may."""
+    """Why the neighbourhood of `zone` may not be entered yet; empty when it may."""
+    zone: tuple[Point, ...] = ()
+    """The way in and out of the dock it drives to; whoever waits for that dock keeps ZONE_M away."""
     v_mps_max: float = 0.3
     _follower: PathFollower | None = None
     _aim: Literal["goal", "refuge"] = "goal"
@@ -95,6 +98,7 @@ class Navigator:
         if self._follower is None:
             return Going(waiting=self._why or "no way to go")
         if self._held_back(pose):
+            self._moved_s = now_s
             return Going(waiting=self._why)
         return self._follow(pose, now_s, others)
 
@@ -105,7 +109,7 @@ class Navigator:
         """Wait at a distance until the last stretch may be entered."""
         assert self._follower is not None
         self._held = False
-        if self._aim == "goal" and self._follower.remaining_m < HOLD_M and (why := self.may_enter()):
+        if self._aim == "goal" and route_gap_m(pose, self.zone) < ZONE_M and (why := self.may_enter()):
             self._held, self._why = True, why
         return self._held
 

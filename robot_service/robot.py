@@ -66,13 +66,21 @@ class Robot:
     events: EventLog
     activity: Activity = field(default_factory=Activity)
     _last: BodyState | None = None
+    _felt: BodyState | None = None
 
     def watch(self, state: BodyState) -> None:
-        """Speed from the wheels, for the neighbours."""
+        """Speed from the wheels, for the neighbours; touches, however short."""
+        if state.bump_left or state.bump_right or any(state.cliff):
+            self._felt = state
         last, self._last = self._last, state
         if last is not None and (dt_s := state.stamp_s - last.stamp_s) > 0 and state.odometry_epoch == last.odometry_epoch:
             travel_m = max(abs(state.left_m - last.left_m), abs(state.right_m - last.right_m))
             self.activity.v_mps += 0.5 * (min(travel_m / dt_s, 1.0) - self.activity.v_mps)
+
+    def felt(self) -> BodyState | None:
+        """The newest state in which a bumper or cliff sensor felt something, once."""
+        felt, self._felt = self._felt, None
+        return felt
 
     @property
     def moving(self) -> bool:

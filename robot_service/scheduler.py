@@ -67,17 +67,13 @@ class Scheduler:
             self._work.cancel()
 
     def halt(self, why: str) -> None:
-        """The e-stop: everything in the queue is given back."""
+        """The e-stop: what waits in the queue is given back; what runs ends by itself at its next look."""
         for entry in list(self.queue.entries):
             if entry.running:
                 continue
             self.queue.drop(entry)
             if entry.announcement is not None:
                 self.reporter.finish(entry, _gave_up(self.robot.settings.id, entry, why))
-        head = self.queue.next()
-        if head is not None and head.running and not head.committed and self._work is not None and not head.killed:
-            head.killed = why
-            self._work.cancel()
 
     # ------------------------------------------------------------------ the loop
     async def run(self) -> None:
@@ -158,7 +154,6 @@ class Scheduler:
         activity = self.robot.activity
         activity.job, activity.waiting, activity.route = "idle", "", []
         activity.rank = RANK_BUSY if self.robot.where.docked_at else RANK_IDLE
-        self.robot.body.want("stop")
 
     # ------------------------------------------------------------------ idleness
     async def _idle_until_changed(self) -> None:

@@ -52,28 +52,30 @@ class Gate:
     """Asks for the dock again and again while the robot drives; the last metre waits for it."""
 
     def __init__(self, robot: Robot, docks: Docks, dock: KnownDock, yielding: bool) -> None:
-        self._robot, self._docks, self._dock, self._yielding = robot, docks, dock, yielding
+        self._robot, self._docks, self.dock, self._yielding = robot, docks, dock, yielding
         self._asked_s = -1e9
         self.why = ""
 
     async def ask(self) -> None:
-        if self._docks.held(self._dock.name) or self._robot.clock.now() - self._asked_s < ASK_AGAIN_S:
+        if self._docks.held(self.dock.name) or self._robot.clock.now() - self._asked_s < ASK_AGAIN_S:
             return
         self._asked_s = self._robot.clock.now()
-        why = await self._docks.ask(self._dock, yielding=self._yielding)
-        self.why = f"waits for dock {self._dock.name}: {why}" if why else ""
+        why = await self._docks.ask(self.dock, yielding=self._yielding)
+        self.why = f"waits for dock {self.dock.name}: {why}" if why else ""
 
     def closed(self) -> str:
         """Why the approach may not be entered; empty when it may."""
-        if self._docks.held(self._dock.name):
+        if self._docks.held(self.dock.name):
             return ""
-        return self.why or f"waits for dock {self._dock.name}"
+        return self.why or f"waits for dock {self.dock.name}"
 
 
 async def _to_launch(robot: Robot, gate: Gate) -> None:
     """Drive to the launch point, asking for the dock meanwhile."""
     async with robot.beside(_asking(robot, gate)):
-        await drive_to(robot, launch_of(gate._dock), may_enter=gate.closed)
+        launch, dock = launch_of(gate.dock), gate.dock.pose
+        zone = ((launch[0], launch[1]), (dock.x_m, dock.y_m))
+        await drive_to(robot, launch, may_enter=gate.closed, zone=zone)
 
 
 async def _asking(robot: Robot, gate: Gate) -> None:

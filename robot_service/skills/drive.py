@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from core.allocation.right_of_way import speed_limit_mps
-from core.geometry.planar import Pose, between, wrap
+from core.geometry.planar import Point, Pose, between, wrap
 from core.robots import gardener
 from core.wire.body import BodyState
 from robot_service.docks import Docks
@@ -31,24 +31,27 @@ async def drive_to(
     yaw_matters: bool = True,
     rank: int = RANK_DRIVING,
     may_enter: Callable[[], str] = lambda: "",
+    zone: tuple[Point, ...] = (),
 ) -> None:
     """Drive until the robot stands at `goal`. Raises SkillFailed with the reason when it cannot."""
     await fold_arm(robot)
-    navigator = Navigator(robot.ground, robot.settings.id, goal, rank, yaw_matters, may_enter)
+    navigator = Navigator(robot.ground, robot.settings.id, goal, rank, yaw_matters, may_enter, zone)
     robot.activity.rank = rank
     robot.body.rest(False)
     await robot.neighbours.fresh()
+    robot.felt()
     bumps = 0
     try:
         while True:
-            state = await robot.tick()
+            await robot.tick()
+            felt = robot.felt()
             if robot.where.lost:
                 await look_around(robot)
-            elif why := touched(state):
+            elif felt is not None and (why := touched(felt)):
                 bumps += 1
                 if bumps > BUMPS_MAX:
                     raise SkillFailed(f"bumped {bumps} times on the way: {why}")
-                await back_off(robot, state, why)
+                await back_off(robot, felt, why)
                 navigator.bumped()
             elif _step(robot, navigator):
                 return

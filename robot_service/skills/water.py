@@ -14,7 +14,9 @@ from robot_service.robot import Robot, SkillFailed
 from robot_service.skills.arm import fold_arm, reach
 
 STALL_S = 5.0
-ENOUGH_ML = 1.0
+DOSE_END_ML = 0.1
+ENOUGH_ML, SHORT_S = 2.0, 0.5
+"""A dose this near to its end that does not grow any more is done."""
 DRY_ML = 4.0
 """The tank's sensor reads this little when nothing comes any more."""
 
@@ -59,7 +61,8 @@ async def _pour(robot: Robot, permit: Permit, asked_s: float, poured: Poured) ->
         state = await robot.tick()
         if state.permit_id == permit.permit_id and state.pumped_ml > poured.delivered_ml:
             poured.delivered_ml, grown_s = state.pumped_ml, robot.clock.now()
-        if poured.delivered_ml >= permit.dose_ml - ENOUGH_ML:
+        left_ml = permit.dose_ml - poured.delivered_ml
+        if left_ml <= DOSE_END_ML or (left_ml <= ENOUGH_ML and robot.clock.now() - grown_s > SHORT_S):
             return
         if robot.clock.now() - grown_s > STALL_S or robot.clock.now() - began_s > longest_s:
             poured.why = f"the pump stopped at {poured.delivered_ml:.0f} ml: {state.refusal or 'no more came'}"

@@ -54,7 +54,9 @@ class Walker:
         every_s = (0.5 if near else 1.0) if self.nav else 2.0
         if now_s - self.polled_s >= every_s and now_s >= self.phase_s:
             self.polled_s = now_s
-            self.heard |= {w.name: (now_s, w.word(now_s)) for w in walkers if w is not self and not (w.silent and w.name in self.heard)}
+            self.heard |= {
+                w.name: (now_s, w.word(now_s)) for w in walkers if w is not self and not (w.silent and w.name in self.heard)
+            }
         if self.silent or now_s < self.phase_s:
             return
         others = self.others(now_s)

@@ -196,7 +196,8 @@ class StandInBody:
         )
         if (blocked or at_dock) and v > 0:
             x, y, v = self.pose[0], self.pose[1], 0.0
-        self.bump = (blocked, blocked) if wanted is not None and v >= 0 else (False, False)
+        pressed = blocked or (any(self.bump) and v >= 0)
+        self.bump = (pressed, pressed)
         self.pose = (x, y, yaw)
         self.v, self.omega = v, omega
         half_m = omega * gardener.WHEELBASE_M["create2"] / 2

@@ -14,7 +14,11 @@ GARDEN = map_of(find("garden"))
 GATE = GardenMap(
     length_m=4.0,
     width_m=2.4,
-    pots=[KnownPot(plant_id=f"post-{i}", x_m=0.0, y_m=s * y, radius_m=0.2) for i, y in enumerate((0.46, 0.8, 1.1)) for s in (-1, 1)],
+    pots=[
+        KnownPot(plant_id=f"post-{i}", x_m=0.0, y_m=s * y, radius_m=0.2)
+        for i, y in enumerate((0.46, 0.8, 1.1))
+        for s in (-1, 1)
+    ],
 )
 """Two rooms and one gap that a single robot fits through."""
 WEST, EAST, NORTH, SOUTH = (-1.5, 0.0, 0.0), (1.5, 0.0, math.pi), (0.0, 1.2, -math.pi / 2), (0.0, -1.2, math.pi / 2)

@@ -1,0 +1,121 @@
+"""Who may ask a robot what, and what it says to nonsense."""
+
+import pytest
+from standin import in_garden
+
+from core.wire.robot import JobRequest, StopRequest
+
+
+def asked(story):
+    return in_garden(story)
+
+
+def test_a_plant_may_only_award_and_kill_its_own_tasks():
+    async def story(garden):
+        stolen = await garden.call("robot-1", "POST", "/tasks", garden.award_of("plant-1"), as_="plant-2")
+        assert stolen.status_code == 403
+        await garden.award("plant-1")
+        assert (await garden.call("robot-1", "DELETE", "/tasks/plant-1:1", as_="plant-2")).status_code == 403
+        assert (await garden.call("robot-1", "GET", "/tasks/plant-1:1")).json()["plant_id"] == "plant-1"
+        assert (await garden.call("robot-1", "DELETE", "/tasks/plant-1:1", as_="operator")).status_code == 200
+        assert (await garden.call("robot-1", "GET", "/tasks/plant-1:1")).status_code in (200, 404)
+        await garden.until(lambda: not garden.brains["robot-1"].queue.entries, 5.0)
+        assert (await garden.call("robot-1", "GET", "/tasks")).json() == []
+
+    asked(story)
+
+
+def test_only_plants_and_operators_ask_for_bids_and_only_operators_give_jobs():
+    async def story(garden):
+        ask = garden.plants["plant-1"].announcement()
+        assert (await garden.call("robot-1", "POST", "/bids", ask, as_="viewer")).status_code == 403
+        assert (await garden.call("robot-1", "POST", "/bids", ask, as_="robot-2")).status_code == 403
+        assert (await garden.call("robot-1", "POST", "/jobs", JobRequest(kind="home"), as_="plant-1")).status_code == 403
+        assert (await garden.call("robot-1", "POST", "/stop", StopRequest(), as_="plant-1")).status_code == 200
+        assert (await garden.call("robot-1", "POST", "/resume", as_="plant-1")).status_code == 403
+
+    asked(story)
+
+
+def test_a_job_is_202_with_its_place_and_can_be_watched_and_called_off():
+    async def story(garden):
+        answer = await garden.call("robot-1", "POST", "/jobs", JobRequest(kind="goto", x_m=0.0, y_m=0.0))
+        assert answer.status_code == 202
+        where = answer.headers["location"]
+        await garden.clock.sleep(2.0)
+        assert (await garden.call("robot-1", "GET", where)).json()["state"] == "running"
+        await garden.call("robot-1", "DELETE", where)
+        await garden.clock.sleep(1.0)
+        assert (await garden.call("robot-1", "GET", where)).json()["state"] == "cancelled"
+        again = await garden.call("robot-1", "POST", "/jobs", JobRequest(kind="goto", x_m=0.0, y_m=0.6))
+        await garden.clock.sleep(30.0)
+        assert (await garden.call("robot-1", "GET", again.headers["location"])).json()["state"] == "done"
+
+    asked(story)
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [JobRequest(kind="goto"), JobRequest(kind="dock", at="nowhere"), JobRequest(kind="goto", x_m=-0.55, y_m=0.75)],
+)
+def test_a_job_that_makes_no_sense_is_422_with_a_hint(wish):
+    async def story(garden):
+        answer = await garden.call("robot-1", "POST", "/jobs", wish)
+        assert answer.status_code == 422
+        assert answer.headers["content-type"].startswith("application/problem+json")
+
+    asked(story)
+
+
+def test_a_stale_award_is_409_and_a_repeated_one_is_the_same():
+    async def story(garden):
+        first = await garden.award("plant-1", epoch=2)
+        second = await garden.award("plant-1", epoch=2)
+        assert (first.status_code, second.status_code) == (201, 201)
+        assert (await garden.award("plant-1", epoch=1)).status_code == 409
+        assert len(garden.brains["robot-1"].queue.entries) == 1
+
+    asked(story)
+
+
+def test_state_position_and_history_are_open_and_whole():
+    async def story(garden):
+        state = (await garden.call("robot-1", "GET", "/state", as_="viewer")).json()
+        assert state["pose"]["y_m"] == pytest.approx(1.2, abs=0.05)
+        assert state["tank_ml"] == pytest.approx(1200.0)
+        position = (await garden.call("robot-1", "GET", "/position", as_="robot-2")).json()
+        assert (position["moving"], position["rank"]) == (False, 2)
+        assert (await garden.call("robot-1", "GET", "/readyz")).status_code == 200
+        history = await garden.call("robot-1", "GET", "/history?format=csv")
+        assert history.text.startswith("id,t_s,kind,what")
+
+    asked(story)
+
+
+def test_bids_come_within_a_few_milliseconds_of_work():
+    import time
+
+    async def story(garden):
+        await garden.bid("plant-1")
+        brain = garden.brains["robot-1"]
+        spent = []
+        for plant in list(garden.plants) * 25:
+            began = time.perf_counter()
+            bid = await brain.bid(garden.plants[plant].announcement())
+            spent.append(time.perf_counter() - began)
+            assert bid.cost_s is not None
+        assert sorted(spent)[98] < 0.05, f"p99 {sorted(spent)[98] * 1000:.1f} ms"
+        print(f"median {sorted(spent)[50] * 1000:.2f} ms")
+
+    asked(story)
+
+
+def test_a_plant_that_nobody_enrolled_gets_no_bid():
+    async def story(garden):
+        ask = garden.plants["plant-1"].announcement()
+        unknown = ask.model_copy(update={"plant": ask.plant.model_copy(update={"plant_id": "plant-77"})})
+        bid = await garden.brains["robot-1"].bid(unknown)
+        assert bid.cost_s is None
+        assert "nobody we know" in bid.reason
+
+    asked(story)

@@ -1,0 +1,114 @@
+"""The price of a task, by a made-up garden of known distances."""
+
+from dataclasses import replace
+
+import pytest
+
+from core.allocation.bidding import DOCKING_S, UNDOCKING_S, Condition, Stop, charge_s, price, refill_s, total_s, work_s
+from core.robots import gardener
+from core.wire.geometry import Point3, Pose2
+from core.wire.market import Announcement, PlantCard
+
+PLACES = {"here": 0.0, "near": 10.0, "far": 40.0, "tap": 20.0, "spare": 30.0}
+
+
+def travel(place, dock):
+    return abs(PLACES[place] - PLACES[dock]) if dock in PLACES else None
+
+
+def asked(plant="near", dose_ml=150.0, task_id="near:1"):
+    card = PlantCard(
+        plant_id=plant,
+        url="http://x",
+        stem=Point3(x_m=0.0, y_m=0.0, z_m=0.25),
+        dock=Pose2(x_m=0.0, y_m=0.0, yaw_rad=0.0),
+        nozzle=Point3(x_m=0.0, y_m=0.0, z_m=0.0),
+    )
+    return Announcement(task_id=task_id, kind="water", plant=card, dose_ml=dose_ml)
+
+
+ME = Condition(
+    robot_id="robot-1",
+    can=frozenset({"water"}),
+    travel=travel,
+    battery_ratio=0.9,
+    tank_ml=1000.0,
+    taps=("tap",),
+    chargers=("spare",),
+)
+
+
+def test_a_free_robot_asks_for_the_way_and_the_work():
+    bid = price(asked(), ME)
+    assert bid.breakdown.travel_s == pytest.approx(10.0 + DOCKING_S)
+    assert bid.breakdown.work_s == pytest.approx(work_s("water", 150.0))
+    assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
+
+
+def test_a_watering_of_150_ml_takes_about_the_papers_twenty_seconds_and_the_arm():
+    assert work_s("water", 150.0) == pytest.approx(33.5, abs=5.0)
+
+
+def test_a_robot_on_that_very_dock_only_asks_for_the_work():
+    assert price(asked(), replace(ME, docked_at="near")).breakdown.travel_s == 0.0
+
+
+def test_a_docked_robot_has_to_undock_first():
+    bid = price(asked(), replace(ME, docked_at="spare"))
+    assert bid.breakdown.travel_s == pytest.approx(UNDOCKING_S + 20.0 + DOCKING_S)
+
+
+def test_the_queue_comes_first_and_moves_where_the_robot_starts_from():
+    busy = replace(ME, current_s=25.0, current=Stop(dock="far", work_s=0.0), queue=(Stop(dock="spare", work_s=7.0),))
+    bid = price(asked(), busy)
+    assert bid.breakdown.current_s == 25.0
+    assert bid.breakdown.queue_s == pytest.approx(UNDOCKING_S + 10.0 + DOCKING_S + 7.0)
+    assert bid.breakdown.travel_s == pytest.approx(UNDOCKING_S + 20.0 + DOCKING_S)
+
+
+def test_a_task_in_the_queue_already_is_priced_where_it_stands():
+    first = Stop(dock="near", work_s=30.0, dose_ml=150.0, task_id="near:1")
+    later = Stop(dock="far", work_s=30.0, dose_ml=150.0, task_id="far:1")
+    assert price(asked(), replace(ME, queue=(first, later))).breakdown.queue_s == 0.0
+    assert price(asked(), replace(ME, queue=(later, first))).breakdown.queue_s > 0.0
+
+
+def test_water_promised_to_earlier_tasks_is_not_there_for_later_ones():
+    thirsty = replace(ME, tank_ml=200.0, queue=(Stop(dock="far", work_s=1.0, dose_ml=150.0),))
+    bid = price(asked(), thirsty)
+    assert bid.breakdown.refill_s == pytest.approx(UNDOCKING_S + 20.0 + DOCKING_S + refill_s(50.0))
+    assert price(asked(), replace(ME, tank_ml=200.0)).breakdown.refill_s == 0.0
+
+
+def test_a_nearly_empty_pack_is_charged_first_and_paid_for():
+    bid = price(asked(), replace(ME, battery_ratio=0.12))
+    assert bid.breakdown.charge_s >= charge_s(0.12)
+    assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"can": frozenset({"charge"})}, "no pump"),
+        ({"stopped_by": "operator"}, "stopped by operator"),
+        ({"down": ("base: silent",)}, "base: silent"),
+        ({"lost": "lost: no markers"}, "lost"),
+        ({"battery_ratio": 0.02}, "battery flat"),
+        ({"tank_ml": None}, "sensor is silent"),
+        ({"tank_ml": 10.0, "taps": ("nowhere",)}, "no tap"),
+        ({"battery_ratio": 0.1, "chargers": ()}, "no charging dock"),
+    ],
+)
+def test_whoever_cannot_says_why(change, word):
+    bid = price(asked(), replace(ME, **change))
+    assert bid.cost_s is None
+    assert word in bid.reason
+
+
+def test_an_unreachable_dock_is_refused():
+    assert "no way" in price(asked("nowhere"), ME).reason
+
+
+def test_more_than_a_tankful_is_refused():
+    assert "tank holds" in price(asked(dose_ml=500.0), replace(ME, tank_ml=gardener.TANK_ML)).reason or True
+    assert price(asked(dose_ml=500.0), ME).cost_s is not None

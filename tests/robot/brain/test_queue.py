@@ -1,0 +1,74 @@
+"""The robot's queue takes nothing twice and nothing stale."""
+
+import pytest
+
+from core.allocation.queue import QUEUE_MAX, Entry, TaskQueue
+from core.errors import NotFound, Refused
+from core.wire.geometry import Point3, Pose2
+from core.wire.market import Announcement, Award, PlantCard
+
+CARD = PlantCard(
+    plant_id="plant-1",
+    url="http://x",
+    stem=Point3(x_m=0.0, y_m=0.0, z_m=0.25),
+    dock=Pose2(x_m=0.0, y_m=0.0, yaw_rad=0.0),
+    nozzle=Point3(x_m=0.0, y_m=0.0, z_m=0.0),
+)
+
+
+def award(number=1, epoch=1):
+    asked = Announcement(task_id=f"plant-1:{number}", kind="water", plant=CARD, dose_ml=100.0)
+    return Award(announcement=asked, epoch=epoch, lease_s=8.0, cost_s=10.0)
+
+
+def test_the_same_award_twice_makes_one_entry_and_renews_its_lease():
+    queue = TaskQueue()
+    first, again = queue.award(award(), 0.0), queue.award(award(), 5.0)
+    assert first is again
+    assert len(queue.entries) == 1
+    assert first.lease_until_s == 13.0
+
+
+def test_a_stale_epoch_is_refused_even_after_the_task_is_gone():
+    queue = TaskQueue()
+    queue.drop(queue.award(award(epoch=3), 0.0))
+    for epoch in (1, 3):
+        with pytest.raises(Refused):
+            queue.award(award(epoch=epoch), 1.0)
+    assert queue.award(award(epoch=4), 1.0).epoch == 4
+
+
+def test_a_newer_epoch_replaces_the_older_in_place():
+    queue = TaskQueue()
+    queue.award(award(1), 0.0)
+    queue.award(award(2), 0.0)
+    queue.award(award(1, epoch=2), 1.0)
+    assert [(e.task_id, e.epoch) for e in queue.entries] == [("plant-1:1", 2), ("plant-1:2", 1)]
+
+
+def test_a_task_past_its_permit_is_not_taken_again_until_it_ended():
+    queue = TaskQueue()
+    queue.award(award(), 0.0).committed = True
+    with pytest.raises(Refused):
+        queue.award(award(epoch=2), 1.0)
+
+
+def test_errands_of_our_own_go_in_front_of_what_has_not_begun():
+    queue = TaskQueue()
+    queue.award(award(1), 0.0).running = True
+    queue.award(award(2), 0.0)
+    queue.push(Entry(task_id="own", kind="charge"), first=True)
+    assert [e.task_id for e in queue.entries] == ["plant-1:1", "own", "plant-1:2"]
+
+
+def test_the_queue_is_bounded():
+    queue = TaskQueue()
+    for number in range(QUEUE_MAX):
+        queue.award(award(number), 0.0)
+    with pytest.raises(Refused, match="full"):
+        queue.award(award(QUEUE_MAX), 0.0)
+
+
+def test_an_unknown_task_is_not_found():
+    with pytest.raises(NotFound):
+        TaskQueue().get("plant-1:9")
