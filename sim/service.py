@@ -23,10 +23,10 @@ from core.mesh.runtime import Runtime
 from core.mesh.worldclock import ClockBeat
 from core.scenario import Scenario, device_ports, find
 from core.wire.documents import Document, NodeCard
+from sim import settings as sim_settings
 from sim.faults import KINDS, Fault, FaultRequest
 from sim.keeping import Keeper
 from sim.pictures import HAND_SIZE, Pictures
-from sim.settings import SimSettings
 from sim.truth import Truth
 from sim.wiring import Rig, assemble, power_up, serve
 
@@ -74,7 +74,7 @@ class GardenTime:
 
 async def build(runtime: Runtime) -> Node:
     """The world's process: reads `SIM_...`, restores the last checkpoint, serves every device on its port."""
-    settings = SimSettings()
+    settings = sim_settings.read()
     scenario = find(settings.scenario)
     seed = scenario.seed if settings.seed is None else settings.seed
     rig = assemble(scenario, seed, runtime.clock, settings.speed or scenario.speed)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from core.errors import ConfigError
 
 
 class SimSettings(BaseSettings):
@@ -24,3 +26,12 @@ class SimSettings(BaseSettings):
     """Where checkpoints go; without it none are made."""
     fresh: bool = False
     """Begin anew although there is a checkpoint."""
+
+
+def read() -> SimSettings:
+    """From the environment; raises ConfigError that names every wrong variable."""
+    try:
+        return SimSettings()
+    except ValidationError as error:
+        wrong = (f"SIM_{str(item['loc'][0]).upper()}: {item['msg']}" for item in error.errors() if item["loc"])
+        raise ConfigError("; ".join(wrong), hint="docs/simulator.md lists what there is") from error
