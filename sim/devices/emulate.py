@@ -97,13 +97,16 @@ async def emulate(emulator: Emulator, path: Path, clock: Clock, ended: asyncio.E
     link = PtyLink()
     host = EmulatorHost(emulator, clock)
     host.attach(link)
-    with _linked(path, link.path):
-        print(path, flush=True)
-        running = asyncio.create_task(host.run())
-        await asyncio.wait([running, asyncio.create_task(ended.wait())], return_when=asyncio.FIRST_COMPLETED)
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-    await host.close()
+    try:
+        with _linked(path, link.path):
+            print(path, flush=True)
+            running, waiting = asyncio.create_task(host.run()), asyncio.create_task(ended.wait())
+            await asyncio.wait([running, waiting], return_when=asyncio.FIRST_COMPLETED)
+            if running.done():
+                running.result()
+            running.cancel()
+    finally:
+        await host.close()
 
 
 async def _until_signalled(emulator: Emulator, path: Path) -> None:

@@ -46,7 +46,7 @@ def test_it_mates_from_a_hundred_starts_within_thirty_seconds(red_side: Side) ->
     "geometry", [{"apex_m": 0.16}, {"apex_m": 0.274}, {"receiver_m": 0.10}, {"receiver_m": 0.15}], ids=str
 )
 def test_it_does_not_depend_on_where_emitter_and_receiver_sit(geometry: dict[str, float]) -> None:
-    failed = [seed for seed in range(1000, 1030) if math.isinf(seconds_to_mate(seed, **geometry))]
+    failed = [seed for seed in range(30) if math.isinf(seconds_to_mate(seed, **geometry))]
     assert not failed, f"seeds {failed}"
 
 
