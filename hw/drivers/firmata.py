@@ -45,7 +45,7 @@ class FirmataBoard(Session):
         self._running, self._sampling = asyncio.Lock(), asyncio.Lock()
         self._greeted, self._arrived, self._wake = Pulse(), Pulse(), Pulse()
         self._version: wire.Version | None = None
-        self._channel, self._codes = -1, list[int]()
+        self._channel, self._codes, self._wanted = -1, list[int](), 0
         self._shut_at_s: dict[int, float] = {}
         """Taps: when to shut; -inf while a shut tap has not confirmed, absent once it has."""
         self._taps: set[int] = set()
@@ -65,7 +65,7 @@ class FirmataBoard(Session):
             await super().run()
 
     async def sample(self, channel: int, count: int) -> tuple[float, ...]:
-        """`count` fresh voltages of one channel [V], 20 ms apart; DriverTimeout after a second of silence."""
+        """`count` fresh voltages of one channel [V], 20 ms apart; DriverTimeout when they are a second late."""
         async with self._sampling:
             await self._wait_up()
             self._channel, self._codes = channel, []
@@ -100,15 +100,17 @@ class FirmataBoard(Session):
             raise LinkDown(f"{self._url} is down: {self.link.why}") from None
 
     async def _collect(self, count: int) -> None:
-        while len(self._codes) < count:
-            try:
-                async with self._clock.timeout(SILENCE_S):
-                    await self._arrived.wait()
-            except TimeoutError:
-                self.silence_s = SILENCE_S  # unless it speaks now, this connection ends and the board is set up anew
-                raise DriverTimeout(self._url, SILENCE_S) from None
-            if self._version is None:
-                raise LinkDown(f"{self._url} went down while sampling")
+        """Returns when `count` codes are there: one wait for all of them, because pots do this day and night."""
+        self._wanted = count
+        within_s = SILENCE_S + count * SAMPLE_INTERVAL_MS / 1000.0
+        try:
+            async with self._clock.timeout(within_s):
+                await self._arrived.wait()
+        except TimeoutError:
+            self.silence_s = SILENCE_S  # unless it speaks now, this connection ends and the board is set up anew
+            raise DriverTimeout(self._url, within_s) from None
+        if self._version is None:
+            raise LinkDown(f"{self._url} went down while sampling")
 
     def _watch_taps(self) -> None:
         """Silence matters while a tap is open, and only then."""
@@ -155,7 +157,8 @@ class FirmataBoard(Session):
                 self._begin(message)
             case wire.Analog(channel, value) if channel == self._channel:
                 self._codes.append(value)
-                self._arrived.fire()
+                if len(self._codes) >= self._wanted:
+                    self._arrived.fire()
             case wire.Sysex(wire.PIN_STATE_RESPONSE, data) if len(data) >= 3:
                 self._confirm(data[0], bool(data[2]))
         if self._version is not None:

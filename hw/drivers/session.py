@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from abc import ABC, abstractmethod
 from typing import NoReturn
 
@@ -55,7 +56,8 @@ class Session(ABC):
 
     def __init__(self, url: str, opener: Opener, clock: Clock, *, name: str, silence_s: float) -> None:
         self._url, self._opener, self._clock = url, opener, clock
-        self._name, self.silence_s = name, silence_s
+        self._name, self._silence_s = name, silence_s
+        self._hushed = Pulse()
         self._log = structlog.get_logger().bind(device=name, url=url)
         self._link: ByteLink | None = None
         self._status = LinkStatus(up=False, why="not connected yet", since_s=0.0)
@@ -72,6 +74,17 @@ class Session(ABC):
     @property
     def link(self) -> LinkStatus:
         return self._status
+
+    @property
+    def silence_s(self) -> float:
+        """How long the device may say nothing [s]; math.inf while it has nothing to say, which costs nothing."""
+        return self._silence_s
+
+    @silence_s.setter
+    def silence_s(self, seconds: float) -> None:
+        if math.isinf(self._silence_s) and not math.isinf(seconds):
+            self._hushed.fire()
+        self._silence_s = seconds
 
     async def wait_link(self, up: bool = True) -> None:
         """Returns when the link is up (or down)."""
@@ -165,7 +178,10 @@ class Session(ABC):
             left_s = self._heard_s + self.silence_s - self._clock.now()
             if left_s <= 1e-6:
                 raise DriverTimeout(self._url, self.silence_s)
-            await self._clock.sleep(min(left_s, WATCH_S_MAX))
+            if math.isinf(left_s):
+                await self._hushed.wait()
+            else:
+                await self._clock.sleep(min(left_s, WATCH_S_MAX))
 
     async def _shut(self, link: ByteLink) -> None:
         try:

@@ -137,7 +137,7 @@ class Ssc32Driver(Session):
         self._ask(tuple(range(wire.CHANNELS)))
         while True:
             self._period_s = self._poll_s()
-            self.silence_s = max(self.silence_s, self._silence_s())
+            self.silence_s = max(self.silence_s, self._patience_s())
             await (self._clock.sleep(POLL_S) if self._period_s == POLL_S else self._pause(self._period_s, self._wake))
             self._ask(tuple(sorted(self._known)))
 
@@ -146,7 +146,7 @@ class Ssc32Driver(Session):
             return POLL_S
         return POLL_RESTING_S if self._resting else POLL_STILL_S
 
-    def _silence_s(self) -> float:
+    def _patience_s(self) -> float:
         return max(SILENCE_S_MIN, SILENCE_POLLS * self._period_s)
 
     async def _pause(self, seconds: float, until: Pulse) -> None:
@@ -205,7 +205,7 @@ class Ssc32Driver(Session):
             moving=answer[-1:] == wire.MOVING,
             analog_v=analog,
         )
-        self.silence_s = self._silence_s()
+        self.silence_s = self._patience_s()
         self._heard()
 
     def _learn(self, counts: Mapping[int, int]) -> None:
