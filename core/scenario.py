@@ -18,7 +18,9 @@ from core.errors import ConfigError
 from core.robots import gardener
 from core.wire.geometry import Pose2
 
-SCENARIOS_DIR = Path(__file__).resolve().parent.parent / "scenarios"
+_HERE = Path(__file__).resolve().parent
+SCENARIOS_DIR = _HERE / "scenarios" if (_HERE / "scenarios").is_dir() else _HERE.parent / "scenarios"
+"""Beside this file in an installed wheel, at the top of a checkout."""
 
 Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")]
 Ratio = Annotated[float, Field(ge=0, le=1)]
