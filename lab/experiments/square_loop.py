@@ -168,7 +168,8 @@ async def _loops(garden: Garden, driver: Driver, loops: int, tell: Tell) -> tupl
 def square_loop(trials: int | None, seed: int, swap: MakeFilter | None, progress: Tell) -> Result:
     """Each trial: 20 loops by odometry, 20 with markers, in a world of its own seed. `swap` replaces the pose filter."""
     trials = trials or TRIALS
-    blind, seeing = [], []
+    blind: list[Drive] = []
+    seeing: list[Drive] = []
     for trial in range(trials):
         for make, drives, name in ((odometry_alone, blind, "odometry"), (swap or with_markers, seeing, "markers")):
             progress(f"seed {seed + trial}: {LOOPS} loops with {name}")
