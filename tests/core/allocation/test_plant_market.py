@@ -290,6 +290,8 @@ class Actor:
     awards: dict[str, int] = field(default_factory=dict)
     permits: list[tuple[str, str, float, float]] = field(default_factory=list)
     """(task, permit, dose, start before)"""
+    used: set[str] = field(default_factory=set)
+    """A permit is one shot, also when its answer comes twice."""
 
 
 @dataclass
@@ -432,7 +434,8 @@ class Play:
             if self.rng.random() < 0.1:
                 self.fault()
                 continue
-            if not any(known == permit.permit_id for _, known, _, _ in actor.permits):
+            if permit.permit_id not in actor.used:
+                actor.used.add(permit.permit_id)
                 actor.permits.append((task_id, permit.permit_id, permit.dose_ml, asked_s + permit.valid_for_s))
 
     def acts(self) -> None:
