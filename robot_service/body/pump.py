@@ -24,7 +24,8 @@ class Doser:
         self._wanted: tuple[str, float] | None = None
         self._debited_ml = 0.0
         self._asked, self._started = asyncio.Event(), asyncio.Event()
-        self._trouble = ""
+        self._failed: tuple[str, str] = ("", "")
+        """The permit that could not be written off last, and why."""
         self.permit_id = ""
 
     def delivered_ml(self, now_s: float) -> float:
@@ -38,8 +39,10 @@ class Doser:
         if permit_id == self.permit_id:
             return Dose(debited_ml=self._debited_ml, delivered_ml=self.delivered_ml(now_s))
         if self._wanted is not None:
-            return Dose(refusal="another dose is being written down")
-        return Dose(used=self._ledger.spent(permit_id), refusal=self._trouble or self._ledger.refusal(dose_ml))
+            return Dose(refusal="the dose is being written down")
+        if permit_id == self._failed[0]:
+            return Dose(refusal=self._failed[1])
+        return Dose(used=self._ledger.spent(permit_id), refusal=self._ledger.refusal(dose_ml))
 
     def want(self, permit_id: str, dose_ml: float) -> None:
         """The gate would let the pump run once this dose is written off."""
@@ -66,11 +69,11 @@ class Doser:
             try:
                 await self._ledger.debit(permit_id, dose_ml)
             except StorageError as error:
-                self._trouble = f"the dose could not be written down: {error}"
+                self._failed = (permit_id, f"the dose could not be written down: {error}")
                 _log.error("no dose", permit=permit_id, why=str(error))
             else:
                 self._actuators.start_count()
-                self.permit_id, self._debited_ml, self._trouble = permit_id, dose_ml, ""
+                self.permit_id, self._debited_ml = permit_id, dose_ml
                 _log.info("dose written off", permit=permit_id, dose_ml=dose_ml)
             finally:
                 self._wanted = None

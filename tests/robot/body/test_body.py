@@ -200,18 +200,24 @@ def test_pausing_within_a_permit_counts_on(tmp_path: Path) -> None:
     story(tmp_path, tell)
 
 
-def test_a_full_disk_means_no_water(tmp_path: Path) -> None:
+def test_a_full_disk_means_no_water_until_there_is_room_again(tmp_path: Path) -> None:
     async def tell(rig: Any) -> None:
         def fail(doc: object) -> int:
             raise StorageError("no space left")
 
-        rig.body.ledger._document.commit = fail
+        document = rig.body.ledger._document
+        real, document.commit = document.commit, fail
         rig.base.sense = dict(DOCKED)
         brain = await rig.brain()
         brain.wish = PUMP
         await rig.clock.sleep(1.0)
         assert not rig.servos.pump_log
-        assert "no space left" in brain.state.refusal or "spent" in brain.state.refusal
+        assert "no space left" in brain.state.refusal
+        document.commit = real
+        await rig.clock.sleep(1.0)
+        assert not rig.servos.pump_log
+        brain.wish = Setpoint(seq=0, pump=True, permit_id="plant-1/p2", dose_ml=30.0)
+        await rig.until(lambda: rig.servos.pump)
 
     story(tmp_path, tell)
 
