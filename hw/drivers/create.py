@@ -35,8 +35,8 @@ DOCKED_S = 0.3
 """Standing on the contacts for so long, the base is put to Passive so that charge flows."""
 KEEP_AWAKE_S = 60.0
 """A Passive base sleeps after five minutes without a command."""
-ROLLING_M = 0.003
-"""A wheel that moves this far in one frame did not get its stop."""
+ROLLING_M = 0.01
+"""A wheel that rolls so far after its stop did not get it."""
 GAP_MPS_MAX = 0.55
 """Travel over a gap in the readings is believed up to this speed."""
 TICKS_PER_TURN = 508.8
@@ -88,6 +88,8 @@ class CreateDriver(Session):
         self._rims = (0, 0)
         """Right and left setpoint on the wire [mm/s]."""
         self._rims_sent_s = self._halted_s = -math.inf
+        self._rolled_m = 0.0
+        """By either wheel since it should stand."""
 
     # hw.ports.Base
 
@@ -305,20 +307,23 @@ class CreateDriver(Session):
 
     def _care(self, moved_m: float, now_s: float) -> None:
         """What the driver does by itself after a reading: repeat what got lost, let a docked base charge."""
-        if self._reading is None or self._mode is None:
+        reading = self._reading
+        if reading is None or self._mode is None:
             return
         if self._seeking:
-            self._seeking = not self._reading.home_base
+            self._seeking = not reading.home_base
+        said_s = max(self._mode_sent_s, self._rims_sent_s)
+        if self._seeking or self._rims != (0, 0) or now_s - said_s < REFRESH_S:
+            self._rolled_m = 0.0
             return
+        self._rolled_m += moved_m
+        rolling = self._rolled_m > ROLLING_M
         if self._mode is Mode.PASSIVE:
-            if self._reading.oi_mode != Mode.PASSIVE and now_s - self._mode_sent_s > MODE_GRACE_S:
+            if rolling or reading.oi_mode != Mode.PASSIVE:
                 self._tell_mode(Mode.PASSIVE, Op.START)
-            return
-        if self._rims != (0, 0) or now_s - self._rims_sent_s < REFRESH_S:
-            return
-        if moved_m > ROLLING_M and not self._resting:
+        elif rolling:
             self._send_rims((0, 0), again=True)
-        if self._reading.home_base and now_s - self._halted_s > DOCKED_S:
+        elif reading.home_base and now_s - self._halted_s > DOCKED_S:
             self._tell_mode(Mode.PASSIVE, Op.START)
 
 

@@ -19,6 +19,8 @@ OPEN_S_MAX = 5.0
 CLOSE_S_MAX = 1.0
 BACKOFF_S_MIN = 0.1
 BACKOFF_S_MAX = 2.0
+GRACE_S = 0.02
+"""After a stall of our own, bytes that wait in the socket are read before the device is called silent."""
 WATCH_S_MAX = 0.5
 """The silence watch looks at least this often, because the allowed silence may shrink while it sleeps."""
 

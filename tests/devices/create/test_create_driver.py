@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -236,18 +237,52 @@ def test_a_base_that_lost_power_is_started_again() -> None:
     play(story)
 
 
+async def deaf(bench: Bench, act: Callable[[], None]) -> None:
+    """Do something while the wire is out for a moment."""
+    bench.host.silence(True)
+    act()
+    await bench.clock.sleep(0.1)
+    bench.host.silence(False)
+
+
 def test_a_stop_that_was_lost_is_repeated() -> None:
     async def story(bench: Bench) -> None:
         await bench.drive_for(1.0, 0.2, 0.0)
-        bench.host.silence(True)
-        bench.driver.stop()
-        await bench.clock.sleep(0.1)
-        bench.host.silence(False)
+        await deaf(bench, bench.driver.stop)
         assert bench.body.wheels == (0.2, 0.2)
         await bench.clock.sleep(0.5)
         assert bench.body.wheels == (0.0, 0.0)
 
     play(story)
+
+
+@both
+def test_a_lost_end_of_a_seek_is_repeated(model: Model) -> None:
+    async def story(bench: Bench) -> None:
+        bench.driver.seek_dock()
+        await bench.clock.sleep(1.0)
+        await deaf(bench, bench.driver.stop)
+        assert bench.emulator.seeking
+        await bench.clock.sleep(0.5)
+        assert not bench.emulator.seeking
+
+    play(story, model, Pose(-1.0, 0.0, 0.0))
+
+
+def test_a_seek_or_a_mode_that_was_lost_is_told_again() -> None:
+    async def story(bench: Bench) -> None:
+        await bench.drive_for(0.5, 0.2, 0.0)
+        await deaf(bench, bench.driver.seek_dock)
+        assert not bench.emulator.seeking
+        await bench.clock.sleep(0.4)
+        bench.driver.seek_dock()
+        await bench.clock.sleep(0.1)
+        assert bench.emulator.seeking
+        await deaf(bench, lambda: bench.driver.drive(0.1, 0.0))
+        await bench.drive_for(0.5, 0.1, 0.0)
+        assert bench.body.wheels == (0.1, 0.1)
+
+    play(story, pose=Pose(-1.5, 0.0, 0.0))
 
 
 def test_safe_mode_gives_up_at_a_cliff_and_takes_the_wheels_again_to_back_off() -> None:
