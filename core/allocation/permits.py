@@ -35,9 +35,13 @@ class OpenPermit(Document):
     """The robot said that its act is over."""
     delivered_ml: Millilitres | None = None
 
+    def valid_until_s(self) -> float:
+        """After this no act may begin [garden s]."""
+        return self.issued_s + self.permit.valid_for_s
+
     def act_over_s(self) -> float:
         """When the act is over at the latest [garden s]."""
-        return self.issued_s + self.permit.valid_for_s + longest_act_s(self.permit.dose_ml)
+        return self.valid_until_s() + longest_act_s(self.permit.dose_ml)
 
     def again(self, now_s: float) -> Permit:
         """The same permit for a repeated request; its validity still counts from the first."""

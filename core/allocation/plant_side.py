@@ -52,7 +52,7 @@ class Market:
         self._tasks = {task.task_id: task for task in before.tasks}
         self._failures = dict(before.failures)
         self._doses = permits.recent(before.doses, now_s)
-        self._live = {task.task_id: self._revived(task, now_s) for task in self.open_tasks()}
+        self._live = {task.task_id: Live.revived(task, now_s, self.rules) for task in self.open_tasks()}
         self._permit = before.open_permit
         self._settle_at_s = math.inf
         self._soil = Soil(None, "not measured yet", -math.inf)
@@ -434,7 +434,8 @@ class Market:
         if report.delivered_ml is not None:
             self._doses = permits.corrected(self._doses, held.permit.permit_id, report.delivered_ml)
         self._permit = held.model_copy(update={"finished": True, "delivered_ml": report.delivered_ml})
-        self._settle_at_s = now_s + self.limits.soak_s
+        # Whatever it says, nothing can begin after the permit's validity.
+        self._settle_at_s = max(now_s, held.valid_until_s()) + self.limits.soak_s
         self.dirty = True
 
     def _expect_settling(self, task: Task, now_s: float) -> None:
@@ -465,16 +466,6 @@ class Market:
 
     # After a restart
 
-    def _revived(self, task: Task, now_s: float) -> Live:
-        if task.state == "announced":
-            return Live(next_ask_s=now_s)
-        return Live(
-            lease_until_s=now_s + self.rules.lease_s,
-            reallocate_s=now_s + self.rules.reallocate_s if task.state == "awarded" else math.inf,
-            resend_s=now_s,  # the award may never have left; a robot knows the (task, epoch) it has
-            running_since_s=now_s if task.state == "running" else math.inf,
-        )
-
     def _restart_permit(self, now_s: float) -> None:
         """The clock of before may not be this one: an open permit waits its whole time anew."""
         if self._permit is None:
@@ -482,7 +473,7 @@ class Market:
         self._permit = self._permit.model_copy(update={"issued_s": now_s})
         task = self._tasks.get(self._permit.permit.task_id)
         if self._permit.finished:
-            self._settle_at_s = now_s + self.limits.soak_s
+            self._settle_at_s = self._permit.valid_until_s() + self.limits.soak_s
         elif task is None or task.state in FINAL_STATES:
             self._settle_at_s = self._permit.act_over_s() + self.limits.soak_s
 

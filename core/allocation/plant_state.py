@@ -121,6 +121,18 @@ class Live:
     told: str = ""
     """Why nobody took it, as last said."""
 
+    @classmethod
+    def revived(cls, task: Task, now_s: float, rules: Rules) -> Live:
+        """After a restart: a holder gets a whole lease anew."""
+        if task.state == "announced":
+            return cls(next_ask_s=now_s)
+        return cls(
+            lease_until_s=now_s + rules.lease_s,
+            reallocate_s=now_s + rules.reallocate_s if task.state == "awarded" else math.inf,
+            resend_s=now_s,  # the award may never have left; a robot knows the (task, epoch) it has
+            running_since_s=now_s if task.state == "running" else math.inf,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Soil:

@@ -328,7 +328,7 @@ class Play:
         """Save, then let effects leave; sometimes the pot dies instead."""
         for task in self.market.open_tasks():
             held_s = self.heard_s.setdefault((task.task_id, task.epoch), self.now_s)
-            if self.now_s - held_s >= self.market.rules.lease_s:
+            if self.now_s - held_s >= self.market.rules.lease_s - 1e-6:
                 self.fault()
         self.market.tick(self.now_s, ROBOTS)
         self.check()
