@@ -14,8 +14,8 @@ from core.manipulation.arm import Joints, limit_broken, reach_m
 from core.robots import gardener
 from core.wire.body import COMMAND_LIFE_S, Setpoint
 
-LIFE_S = COMMAND_LIFE_S - 0.04
-"""Two control periods early, so that the wheels stand within the contract's life."""
+LIFE_S = COMMAND_LIFE_S - 0.06
+"""Three control periods early, so that the wheels stand within the contract's life."""
 BASE_FRESH_S = 0.5
 SERVO_FRESH_S = 2.0
 ACCEL_MPS2 = 1.0
