@@ -67,7 +67,7 @@ def _service(process: Process) -> dict[str, Any]:
         service["ports"] = [f"127.0.0.1:{process.port}:{process.port}"]
         service["healthcheck"] = {
             "test": _CHECK,
-            "interval": "15s",
+            "interval": "30s",
             "timeout": "5s",
             "retries": 4,
             "start_period": "60s",
@@ -78,7 +78,6 @@ def _service(process: Process) -> dict[str, Any]:
         waits[name] = {"condition": "service_started" if name.endswith("-body") else "service_healthy"}
     service["depends_on"] = waits
     service["restart"] = "unless-stopped"
-    service["init"] = True
     service["cap_drop"] = ["ALL"]
     service["security_opt"] = ["no-new-privileges:true"]
     return service

@@ -17,7 +17,7 @@ DOCUMENT: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_tex
 SERVICES: dict[str, Any] = {name: service for name, service in DOCUMENT["services"].items() if name != "init"}
 KNOWN = {
     "image", "build", "command", "user", "network_mode", "environment", "volumes", "ports", "healthcheck", "depends_on",
-    "restart", "init", "cap_drop", "security_opt",
+    "restart", "cap_drop", "security_opt",
 }  # fmt: skip
 
 
