@@ -16,7 +16,7 @@ from robot_service.settings import RobotSettings
 
 async def make(runtime: Runtime) -> Node:
     try:
-        settings = RobotSettings()  # type: ignore[call-arg]
+        settings = RobotSettings()
     except ValidationError as error:
         told = "; ".join(f"ROBOT_{'.'.join(map(str, e['loc'])).upper()}: {e['msg']}" for e in error.errors())
         raise ConfigError(told, hint="see docs/robot.md") from None

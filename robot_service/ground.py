@@ -10,7 +10,7 @@ import numpy as np
 from core.allocation.right_of_way import CLEAR_M, KEEP_M, Other, along, growth_m, route_gap_m
 from core.geometry.planar import Point, Pose
 from core.planning.grid import CSpace, GridMap
-from core.planning.kernels import FAR, STRAIGHT
+from core.planning.kernels import FAR
 from core.planning.wavefront import COMFORT_M, MARGIN_M, Field, Path, wavefront
 from core.robots import gardener
 from core.robots.garden_map import DOCK_RADIUS_M, GardenMap
@@ -19,7 +19,7 @@ RADIUS_M = gardener.BODY_RADIUS_M + MARGIN_M
 EDGE_M = 0.03
 """The arena's edge is a drop: planned paths keep this much more from it."""
 BUMP_RADIUS_M = 0.08
-BUMP_LIFE_S = 120.0
+BUMP_LIFE_S = 30.0
 OTHER_RADIUS_M = KEEP_M - RADIUS_M + CLEAR_M
 """A neighbour as an obstacle, so that inflated it keeps KEEP_M and a little."""
 
@@ -96,7 +96,7 @@ class Ground:
         return None if path is None else path.length_m
 
     def with_others(self, discs: Iterable[Other], routes: Iterable[Sequence[Point]], me: Point | Pose) -> CSpace:
-        """Others as discs, grown by what they may have driven since; routes as corridors. Never swallows `me` by growth alone."""
+        """Others as discs, grown by what they may have driven since, and routes as corridors. Growth never swallows `me`."""
         grid = self._grid()
         for other in discs:
             grid.add_disc(other.x_m, other.y_m, OTHER_RADIUS_M + _growth(other, me))
@@ -156,6 +156,3 @@ def _drawn(garden: GardenMap, cell_m: float) -> GridMap:
 
 def near_route(point: Point | Pose, route: Sequence[Point]) -> bool:
     return route_gap_m(point, route) < KEEP_M + CLEAR_M
-
-
-__all__ = ["STRAIGHT", "Bumped", "Ground", "near_route"]

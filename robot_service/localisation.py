@@ -17,6 +17,7 @@ FILTERS = {"kalman": PoseFilter, "exponential": ExponentialFilter}
 BLIND_S_MAX = 12.0
 """Driving this long without a believed fix is driving blind."""
 SIGMA_M_MAX = 0.15
+DOCK_SIGMA_M = 0.02
 AT_DOCK_M = 0.30
 AT_DOCK_RAD = 0.6
 
@@ -84,13 +85,14 @@ class Localisation:
             self.rejected += 1
 
     def _sit(self, state: BodyState, last: BodyState | None) -> None:
-        """On a dock the place is known: it corrects the estimate once, when contact is made."""
+        """On a dock the place is known to a centimetre or two, which helps when the estimate is worse than that."""
         if not state.docked:
             self.docked_at = ""
             return
         if not self.docked_at and (name := self.dock_here()):
             self.docked_at = name
-            self._filter.correct(*self._docks[name], state.stamp_s)
+            if self._filter.lost or self.sigma_m > DOCK_SIGMA_M:
+                self._filter.correct(*self._docks[name], state.stamp_s)
 
     def dock_here(self) -> str:
         """The dock we would stand at by the estimate; empty when none is so near."""

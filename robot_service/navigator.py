@@ -147,18 +147,14 @@ class Navigator:
             self._why = f"gives way to {before.robot_id}"
             self._flee(pose, others)
             return
-        if self._aim == "refuge" and self._follower is not None:
-            if not self._blocked_on_refuge(waited_s):
-                return
+        if self._aim == "refuge" and self._follower is not None and waited_s <= PATIENCE_S:
+            return
         if now_s < self._rest_until_s:
             return
         if waited_s > RETREAT_S and math.fmod(waited_s, RETREAT_S) < LOOK_S:
             self._flee(pose, others, from_all=True)
             return
         self._plan(pose, others, patient=waited_s < PATIENCE_S)
-
-    def _blocked_on_refuge(self, waited_s: float) -> bool:
-        return waited_s > PATIENCE_S
 
     def _plan(self, pose: Pose, others: Sequence[Other], patient: bool) -> None:
         me = (self.rank, self.me)

@@ -27,8 +27,8 @@ class Planner:
     docks: Docks
     travel: Travel
 
-    async def run(self, entry: Entry, wanted: bool) -> Report:
-        """Do one entry; the report says how it ended. `wanted` tells a charge that tasks wait. Never raises SkillFailed."""
+    async def run(self, entry: Entry) -> Report:
+        """Do one entry; the report says how it ended. Never raises SkillFailed."""
         poured = Poured()
         try:
             async with self.robot.clock.timeout(TASK_S.get(entry.kind, 900.0)):

@@ -1,4 +1,4 @@
-"""Tells plants how their tasks stand: at every change and before a quarter of the lease has passed; the end until it is heard."""
+"""Tells plants how their tasks stand: at every change, every quarter of a lease, and the end until it is heard."""
 
 from __future__ import annotations
 

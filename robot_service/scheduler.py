@@ -5,19 +5,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Coroutine
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from core.allocation.bidding import (
-    BATTERY_ENOUGH_RATIO,
     BATTERY_FORCED_RATIO,
     BATTERY_LOW_RATIO,
     TANK_RESERVE_ML,
 )
 from core.allocation.queue import Entry, TaskQueue
 from core.allocation.right_of_way import RANK_IDLE, in_the_way_of
-from core.errors import GardenError
 from core.geometry.planar import distance_m
-from core.robots import gardener
 from core.wire.market import Report
 from robot_service.docks import Docks
 from robot_service.planner import Planner
@@ -90,20 +87,21 @@ class Scheduler:
         if self._stopped():
             return None
         head = self.queue.next()
-        if (own := self._own_errand(head)) and self.robot.clock.now() >= self._own_after_s:
-            if not self.queue.has(own):
-                self._own_number += 1
-                self.queue.push(Entry(task_id=f"{self.robot.settings.id}:{own}:{self._own_number}", kind=own), first=True)  # type: ignore[arg-type]
+        own = self._own_errand(head)
+        if own is not None and not self.queue.has(own) and self.robot.clock.now() >= self._own_after_s:
+            self._own_number += 1
+            task_id = f"{self.robot.settings.id}:{own}:{self._own_number}"
+            self.queue.push(Entry(task_id=task_id, kind=own), first=True)
         return self.queue.next()
 
     def _stopped(self) -> bool:
         state = self.robot.body.state
         return state is None or bool(self.robot.body.down) or state.stopped
 
-    def _own_errand(self, head: Entry | None) -> str:
+    def _own_errand(self, head: Entry | None) -> Literal["charge", "refill"] | None:
         state = self.robot.body.state
         if state is None or (head is not None and head.kind in ("charge", "refill", "job")):
-            return ""
+            return None
         limit_ratio = BATTERY_FORCED_RATIO if head is not None else BATTERY_LOW_RATIO
         resting = bool(self.robot.where.docked_at)
         if state.battery_ratio < limit_ratio and (head is not None or not resting):
@@ -111,12 +109,12 @@ class Scheduler:
         dose_ml = head.announcement.dose_ml if head is not None and head.announcement is not None else 0.0
         if state.tank_ml is not None and head is not None and state.tank_ml < dose_ml + TANK_RESERVE_ML:
             return "refill"
-        return ""
+        return None
 
     async def _execute(self, entry: Entry) -> None:
         entry.running, self.began_s = True, self.robot.clock.now()
         self.robot.note("task", f"begins {entry.kind} {entry.plant_id}".strip(), task_id=entry.task_id)
-        report, cut = await self._worked(self.planner.run(entry, bool(self.queue.entries)))
+        report, cut = await self._worked(self.planner.run(entry))
         self.queue.drop(entry)
         self._rest()
         if report is None:
@@ -230,6 +228,3 @@ class Scheduler:
 
 def _gave_up(robot_id: str, entry: Entry, why: str) -> Report:
     return Report(robot_id=robot_id, epoch=entry.epoch, state="failed", phase=entry.phase, reason=why[:500])
-
-
-__all__ = ["BATTERY_ENOUGH_RATIO", "GardenError", "Scheduler", "gardener"]

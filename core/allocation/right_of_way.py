@@ -1,8 +1,9 @@
 """Who goes first when robots meet, and how near they may come. Pure geometry on what neighbours last told of themselves.
 
-Rules. (1) Nobody drives towards a place nearer than `KEEP_M` to where another may be by now. (2) Lower rank goes first, ties by id:
-the later one plans round the earlier one's disc and the next metres of its route, and leaves that route when it stands in it.
-(3) Whoever goes first plans as if the others will give way, except round those who stand still and cost only a small detour.
+Rules. (1) Nobody drives towards a place nearer than `KEEP_M` to where another may be by now. (2) Lower rank goes first,
+ties by id: the later one plans round the earlier one's disc and the next metres of its route, and leaves that route when
+it stands in it. (3) Whoever goes first plans as if the others will give way, except round those who stand still and cost
+only a small detour.
 Source: prioritised planning (Erdmann and Lozano-Perez, On Multiple Moving Objects).
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from core.geometry.planar import Point, Pose
 from core.robots import gardener
@@ -87,7 +89,7 @@ def route_gap_m(point: Point | Pose, route: Sequence[Point]) -> float:
     """Distance from a point to a polyline [m]; infinite for an empty one."""
     if len(route) == 1:
         return math.hypot(point[0] - route[0][0], point[1] - route[0][1])
-    gaps = (_segment_gap_m(point, a, b) for a, b in zip(route, route[1:], strict=False))
+    gaps = (_segment_gap_m(point, a, b) for a, b in pairwise(route))
     return min(gaps, default=math.inf)
 
 
@@ -114,7 +116,7 @@ def _settled(other: Other) -> bool:
 def along(route: Sequence[Point], every_m: float = 0.1) -> list[Point]:
     """Points along a polyline, no further apart than `every_m`."""
     points: list[Point] = list(route[:1])
-    for (ax, ay), (bx, by) in zip(route, route[1:], strict=False):
+    for (ax, ay), (bx, by) in pairwise(route):
         count = max(1, math.ceil(math.hypot(bx - ax, by - ay) / every_m))
         points += [(ax + (bx - ax) * i / count, ay + (by - ay) * i / count) for i in range(1, count + 1)]
     return points

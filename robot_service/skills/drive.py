@@ -1,4 +1,4 @@
-"""Navigate: drive to a pose among pots and other robots, recover from bumps, look around when lost. Undock: back straight out."""
+"""Navigate: drive to a pose among pots and other robots, recover from bumps, look around when lost. Undock: back out."""
 
 from __future__ import annotations
 

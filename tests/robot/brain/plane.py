@@ -84,7 +84,7 @@ def walk(
     cell_m: float = 0.04,
     silent: frozenset[int] = frozenset(),
 ) -> tuple[float, float, list[Walker]]:
-    """Everybody drives from start to goal. Returns (seconds until all arrived, the nearest two centres ever came, walkers)."""
+    """Everybody drives from start to goal. Returns (seconds, nearest two centres ever came, walkers)."""
     rng = random.Random(seed)
     walkers = [
         Walker(f"robot-{i + 1}", start, goal, Ground(garden, cell_m), rng.uniform(0.0, 1.0), i in silent)

@@ -114,12 +114,13 @@ class StandInBody:
         self._arm_goal: tuple[Joints, float, float] | None = None
         self.poured_at: list[tuple[str, float]] = []
         self.states = 0
+        self._dock_of: tuple[Pose | None, str] = (None, "")
         plane.bodies.append(self)
         net.listen(name, self._accept)
 
     def _accept(self, link: ByteLink) -> None:
         if self.link is not None:
-            asyncio.ensure_future(self.link.close())
+            self._closing = asyncio.ensure_future(self.link.close())
         self.link = link
         self._listener = asyncio.ensure_future(self._listen(link))
 
@@ -150,6 +151,11 @@ class StandInBody:
     @property
     def dock(self) -> str:
         """The dock whose contacts it stands on."""
+        if self._dock_of[0] is not self.pose:
+            self._dock_of = (self.pose, self._find_dock())
+        return self._dock_of[1]
+
+    def _find_dock(self) -> str:
         for dock in self.plane.garden.docks:
             x, y, yaw = between((dock.pose.x_m, dock.pose.y_m, dock.pose.yaw_rad), self.pose)
             if abs(x) < CONTACT_M and abs(y) < 0.03 and abs(yaw) < CONTACT_RAD:
@@ -164,8 +170,9 @@ class StandInBody:
         told_s = -1e9
         while True:
             moving = self.v != 0 or self.omega != 0 or self.clock.now() - self.heard_s < 1.0
-            await self.clock.sleep(DT_S)
-            self.step(DT_S)
+            dt_s = DT_S if moving else 5 * DT_S
+            await self.clock.sleep(dt_s)
+            self.step(dt_s)
             if moving or self.clock.now() - told_s >= 0.5:
                 told_s = self.clock.now()
                 self._tell()
@@ -187,9 +194,12 @@ class StandInBody:
             v, omega = self._seek()
         if any(self.bump) and v > 0:
             v = 0.0
+        if v == 0.0 and omega == 0.0:
+            self.v = self.omega = 0.0
+            return
         x, y, yaw = arc(self.pose, v * dt_s, omega * dt_s)
         blocked = not self.plane.free(self, x, y)
-        at_dock = any(
+        at_dock = v > 0 and any(
             abs(between((d.pose.x_m, d.pose.y_m, d.pose.yaw_rad), (x, y, yaw))[1]) < 0.1
             and 0.004 < between((d.pose.x_m, d.pose.y_m, d.pose.yaw_rad), (x, y, yaw))[0] < 0.1
             for d in self.plane.garden.docks
@@ -328,8 +338,13 @@ class FakePlant:
             if task_id in self.permits:
                 raise Refused("a permit was given already")
             self.permits[task_id] = Permit(
-                permit_id=f"permit:{task_id}", task_id=task_id, epoch=wish.epoch, act="water", dose_ml=wish.amount_ml, valid_for_s=30.0
-            )  # fmt: skip
+                permit_id=f"permit:{task_id}",
+                task_id=task_id,
+                epoch=wish.epoch,
+                act="water",
+                dose_ml=wish.amount_ml,
+                valid_for_s=30.0,
+            )
             return self.permits[task_id]
 
         _dock_routes(self.app, self.docks, self.clock)
