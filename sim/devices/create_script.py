@@ -53,7 +53,7 @@ class Scripts:
         if wait.op == Op.WAIT_TIME:
             return now_s - self._begun_s + 1e-9 >= 0.1 * wait.data[0]
         if wait.op == Op.WAIT_EVENT:
-            (event,) = struct.unpack(">b", wait.data)
+            event: int = struct.unpack(">b", wait.data)[0]
             happened = abs(event) in _EVENTS and _EVENTS[abs(event)](sense, odometer.buttons, mode)
             return happened == (event > 0)
         gauge = odometer.travel_mm if wait.op == Op.WAIT_DISTANCE else odometer.yaw_deg

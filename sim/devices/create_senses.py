@@ -99,8 +99,9 @@ class Senses:
             return ChargingState.NOT_CHARGING.value
         if not s.charging:
             return ChargingState.WAITING.value
-        full = s.charge_ah >= FULL_RATIO * s.capacity_ah
-        return (ChargingState.TRICKLE if full else ChargingState.FULL_CHARGING).value
+        if s.charge_ah >= FULL_RATIO * s.capacity_ah:
+            return ChargingState.TRICKLE.value
+        return ChargingState.FULL_CHARGING.value
 
     def cliff_signal(self, drop: bool) -> int:
         return max(0, (DROP_SIGNAL if drop else FLOOR_SIGNAL) + self._rng.randint(-SIGNAL_NOISE, SIGNAL_NOISE))
