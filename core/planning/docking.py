@@ -28,7 +28,8 @@ OMEGA_RADPS_MAX = 0.9
 LOOKAHEAD_M = 0.16
 SETTLE_S = 1.2
 """Charge current shows this long after the contacts touch, at worst."""
-OVERRUN_M = 0.05
+OVERRUN_M, OVERRUN_M_MAX = 0.05, 0.09
+"""So far beyond the dock by its own reckoning it believes, at its first and at later tries, that it misjudged the way."""
 RETREAT_M = 0.40
 TRIES = 5
 TIME_S = 60.0
@@ -49,6 +50,8 @@ class DockSense(Protocol):
     def ir_red(self) -> bool: ...
     @property
     def ir_green(self) -> bool: ...
+    @property
+    def contacts(self) -> bool: ...
     @property
     def docked(self) -> bool: ...
 
@@ -98,6 +101,10 @@ class BeamDocking:
         x, y, yaw = self._base
         return x, y + self._dy_m, wrap(yaw + self._dyaw_rad)
 
+    @property
+    def _overrun_m(self) -> float:
+        return OVERRUN_M if self.tries == 1 else OVERRUN_M_MAX
+
     def step(self, sense: DockSense, pose_estimate: Pose | None, now_s: float) -> DockCommand:
         """One setpoint. `pose_estimate` is the base in the world, or None when only odometry and beams are to be had."""
         if self._begun_s is None:
@@ -123,8 +130,9 @@ class BeamDocking:
             if x <= -RETREAT_M or now_s - self._since_s > 6.0:
                 self._enter("turn", now_s)
             return BACK_MPS, 0.0
-        if sense.bump_left or sense.bump_right or x > OVERRUN_M:
-            near = x > -0.10
+        if sense.contacts or sense.bump_left or sense.bump_right or x > self._overrun_m:
+            # A Create lets no charge current in while its wheels are told to turn: stand still and see.
+            near = sense.contacts or x > -0.10
             self._enter("settle" if near else "back", now_s)
             self.tries += 0 if near else 1
             return 0.0, 0.0

@@ -1,15 +1,18 @@
 """What crosses the local stream between a robot's brain and its body: one JSON document a line.
 
-Plain dataclasses rather than pydantic: the stream runs at 50 Hz and both ends are the same robot. `decode` still refuses
-wrong types, unknown fields and non-finite numbers, since the body must survive any brain.
+Plain dataclasses rather than pydantic: the stream runs at 50 Hz and both ends are the same robot. A field at its default
+is left out of the line. `decode` still refuses wrong types, unknown fields and non-finite numbers, since the body must
+survive any brain.
 """
 
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal, TypeVar
+from dataclasses import MISSING, dataclass, field, fields
+from math import isfinite
+from operator import attrgetter
+from types import NoneType
+from typing import Any, Literal
 
 from core.errors import Unprocessable
 
@@ -83,6 +86,8 @@ class BodyState:
     ir_red: bool = False
     ir_green: bool = False
     ir_field: bool = False
+    contacts: bool = False
+    """On a dock's contacts: they are under voltage."""
     docked: bool = False
     """On a dock's contacts with charge current flowing."""
     oi_mode: int = 0
@@ -114,34 +119,110 @@ class BodyState:
 Message = Hello | Setpoint | Control | BodyState
 _KINDS: dict[str, type[Message]] = {"hello": Hello, "set": Setpoint, "control": Control, "state": BodyState}
 _NAMES = {cls: name for name, cls in _KINDS.items()}
-_ORDER = {cls: tuple(f.name for f in fields(cls)) for cls in _NAMES}
-_FIELDS = {cls: frozenset(names) for cls, names in _ORDER.items()}
-_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
-M = TypeVar("M")
+_FIELDS = {cls: tuple((f.name, f.default) for f in fields(cls)) for cls in (*_NAMES, Marker)}
+_VALUES = {cls: attrgetter(*(name for name, _ in told)) for cls, told in _FIELDS.items() if len(told) > 1}
+_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False)
 
 
 def encode(message: Message) -> bytes:
-    """One line, newline included."""
+    """One line, newline included; raises ValueError for a number that is not finite."""
     cls = type(message)
-    document: dict[str, Any] = {"t": _NAMES[cls]}
-    for name in _ORDER[cls]:
-        value = getattr(message, name)
-        document[name] = asdict(value) if isinstance(value, Marker) else value
+    document = {"t": _NAMES[cls], **_told(message)}
+    if (marker := document.get("marker")) is not None:
+        document["marker"] = _told(marker)
     return _ENCODER.encode(document).encode() + b"\n"
+
+
+def _told(message: Any) -> dict[str, Any]:
+    """The fields that say more than their default."""
+    told = _FIELDS[type(message)]
+    values = _VALUES.get(type(message))
+    if values is None:
+        return {name: getattr(message, name) for name, _ in told}
+    pairs = zip(told, values(message), strict=True)
+    return {name: value for (name, default), value in pairs if default is MISSING or value != default}
+
+
+_NUMBER = frozenset((int, float))
+_ACCEPTED: dict[str, frozenset[type]] = {
+    "int": frozenset((int,)),
+    "float": _NUMBER,
+    "bool": frozenset((bool,)),
+    "str": frozenset((str,)),
+    "float | None": _NUMBER | {NoneType},
+    "Marker | None": frozenset((dict, NoneType)),
+}
+"""The types a field's JSON value may have, by its annotation; a tuple comes as a list, a Literal as a str."""
+
+
+def _accepted(annotation: str) -> frozenset[type]:
+    if annotation.startswith("Literal"):
+        return _ACCEPTED["str"]
+    if annotation.startswith("tuple"):
+        return frozenset((list, NoneType) if annotation.endswith("| None") else (list,))
+    return _ACCEPTED[annotation]
+
+
+_TYPES = {cls: {f.name: _accepted(str(f.type)) for f in fields(cls)} for cls in (*_NAMES, Marker)}
+_ITEMS: dict[str, tuple[frozenset[type], int | None]] = {
+    "arm": (_NUMBER, 4),
+    "arm_rad": (_NUMBER, None),
+    "cliff": (_ACCEPTED["bool"], 4),
+    "down": (_ACCEPTED["str"], None),
+}
+"""What a list holds, and how many."""
 
 
 def decode(line: bytes) -> Message:
     """Read one line; raises Unprocessable for anything that is not exactly a message."""
     try:
-        document = json.loads(line, parse_constant=_refuse_constant)
-    except ValueError as error:
+        document = _DECODER.decode(line.decode())
+    except (ValueError, RecursionError) as error:
         raise Unprocessable(f"not a body message: {error}") from error
     if not isinstance(document, dict) or (cls := _KINDS.get(str(document.pop("t", "")))) is None:
         raise Unprocessable("not a body message: unknown kind")
-    if unknown := document.keys() - _FIELDS[cls]:
-        raise Unprocessable(f"unknown fields: {', '.join(sorted(unknown))}")
+    _check(cls, document)
     try:
-        return _checked(cls(**{name: _frozen(value) for name, value in document.items()}))
+        return cls(**document)
+    except TypeError as error:
+        raise Unprocessable(str(error)) from error
+
+
+def _check(cls: type, document: dict[str, Any]) -> None:
+    """Every value has its field's type; lists become tuples and the marker a Marker, in place."""
+    types = _TYPES[cls]
+    for name, value in document.items():
+        kind = type(value)
+        if (accepted := types.get(name)) is None:
+            raise Unprocessable(f"unknown fields: {name}")
+        if kind not in accepted:
+            raise Unprocessable(f"{name} is a {kind.__name__}")
+        if kind is float and not isfinite(value):
+            raise Unprocessable(f"{name} must be a finite number")
+        if kind is list:
+            document[name] = _items(name, value)
+        elif kind is dict:
+            _check(Marker, value)
+            document[name] = _marker(value)
+    if cls is Setpoint and document.get("base", "stop") not in ("stop", "drive", "seek_dock"):
+        raise Unprocessable("base must be stop, drive or seek_dock")
+    if cls is Control and document.get("order") not in ("stop", "resume", "rest", "wake"):
+        raise Unprocessable("order must be stop, resume, rest or wake")
+
+
+def _items(name: str, values: list[Any]) -> tuple[Any, ...]:
+    accepted, count = _ITEMS[name]
+    if count is not None and len(values) != count:
+        raise Unprocessable(f"{name} must be {count} values")
+    for value in values:
+        if type(value) not in accepted or (type(value) is float and not isfinite(value)):
+            raise Unprocessable(f"{name} holds {value!r}")
+    return tuple(values)
+
+
+def _marker(document: dict[str, Any]) -> Marker:
+    try:
+        return Marker(**document)
     except TypeError as error:
         raise Unprocessable(str(error)) from error
 
@@ -150,40 +231,7 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not a number we take")
 
 
-def _frozen(value: Any) -> Any:
-    if isinstance(value, list):
-        return tuple(value)
-    return Marker(**value) if isinstance(value, dict) else value
-
-
-_NUMBERS = {
-    Setpoint: ("seq", "v_mps", "omega_radps", "arm_s", "dose_ml"),
-    BodyState: ("stamp_s", "left_m", "right_m", "battery_ratio"),
-}
-
-
-def _checked(message: M) -> M:
-    for name in _NUMBERS.get(type(message), ()):
-        value = getattr(message, name)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise Unprocessable(f"{name} must be a finite number")
-    if isinstance(message, Setpoint):
-        _check_setpoint(message)
-    return message
-
-
-def _check_setpoint(setpoint: Setpoint) -> None:
-    if setpoint.base not in ("stop", "drive", "seek_dock"):
-        raise Unprocessable("base must be stop, drive or seek_dock")
-    if not isinstance(setpoint.pump, bool) or not isinstance(setpoint.permit_id, str):
-        raise Unprocessable("pump must be true or false, permit_id a text")
-    joints = setpoint.arm if setpoint.arm is not None else ()
-    extra = () if setpoint.gripper_m is None else (setpoint.gripper_m,)
-    if setpoint.arm is not None and (not isinstance(setpoint.arm, tuple) or len(setpoint.arm) != 4):
-        raise Unprocessable("arm must be four joint angles")
-    for value in (*joints, *extra):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise Unprocessable("arm and gripper goals must be finite numbers")
+_DECODER = json.JSONDecoder(parse_constant=_refuse_constant)
 
 
 @dataclass(slots=True)

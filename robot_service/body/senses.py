@@ -159,6 +159,7 @@ class Senses:
             ir_red=b.ir_red,
             ir_green=b.ir_green,
             ir_field=b.ir_field,
+            contacts=b.home_base,
             docked=b.mated,
             oi_mode=b.oi_mode,
             battery_ratio=round(b.battery_ratio, 4),

@@ -32,6 +32,7 @@ class Plane:
     bump_right: bool = False
     ir_red: bool = False
     ir_green: bool = False
+    contacts: bool = False
     docked: bool = False
 
     def move(self, command: DockCommand, dt_s: float) -> None:
@@ -44,7 +45,8 @@ class Plane:
         touching = x >= 0.0
         self.bump_left = self.bump_right = touching and command.v_mps > 0.0
         self.pose = (min(x, 0.0), y, yaw)
-        self.docked = self.pose[0] >= -0.015 and abs(y) <= 0.02 and abs(yaw) <= math.radians(6)
+        self.contacts = self.pose[0] >= -0.015 and abs(y) <= 0.02 and abs(yaw) <= math.radians(6)
+        self.docked = self.contacts and command.v_mps == command.omega_radps == 0.0
         self._see()
 
     def _see(self) -> None:
