@@ -115,7 +115,7 @@ class MemoryLink:
         self._buffer = bytearray()
         self._flight: deque[bytes | None] = deque()
         """On the way to the peer, oldest first; None is the end. The loop's timers of one instant fire in any order."""
-        self._arrived = asyncio.Event()
+        self._reader: asyncio.Future[None] | None = None
         self._closed = False
         self.peer: MemoryLink | None = None
         self.muted = False
@@ -129,8 +129,13 @@ class MemoryLink:
         while not self._buffer:
             if self._closed:
                 raise LinkDown(f"{self._name} was closed by the other side")
-            self._arrived.clear()
-            await self._arrived.wait()
+            if self._reader is not None:
+                raise RuntimeError(f"two readers at {self._name}")
+            self._reader = asyncio.get_running_loop().create_future()
+            try:
+                await self._reader
+            finally:
+                self._reader = None
         data = bytes(self._buffer[:READ_BYTES_MAX])
         del self._buffer[:READ_BYTES_MAX]
         return data
@@ -148,7 +153,8 @@ class MemoryLink:
 
     def _launch(self, data: bytes | None) -> None:
         self._flight.append(data)
-        asyncio.get_running_loop().call_later(self._latency_s, self._land)
+        loop = asyncio.get_running_loop()
+        loop.call_at(loop.time() + self._latency_s, self._land)
 
     def _land(self) -> None:
         data = self._flight.popleft()
@@ -168,11 +174,16 @@ class MemoryLink:
     def _deliver(self, data: bytes) -> None:
         if not self._closed:
             self._buffer += data
-            self._arrived.set()
+            self._stir()
 
     def _shut(self) -> None:
         self._closed = True
-        self._arrived.set()
+        self._stir()
+
+    def _stir(self) -> None:
+        """Wake the reader."""
+        if self._reader is not None and not self._reader.done():
+            self._reader.set_result(None)
 
 
 def memory_pair(clock: Clock, name: str = "memory", latency_s: float = 0.001) -> tuple[MemoryLink, MemoryLink]:

@@ -7,6 +7,7 @@ as in Macenski et al., Regulated Pure Pursuit.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -60,6 +61,8 @@ class PathFollower:
         self._lengths = [distance_m(a, b) for a, b in zip(self._points, self._points[1:], strict=False)]
         self._starts = [sum(self._lengths[:i]) for i in range(len(self._lengths))]
         self.length_m = sum(self._lengths)
+        self._ends = [start_m + length_m for start_m, length_m in zip(self._starts, self._lengths, strict=True)]
+        self._corners = _corners(self._points, self._starts)
         self._goal_yaw = goal_yaw_rad
         self._v_max, self._clearance, self._tolerance_m = v_mps_max, clearance, tolerance_m
         self._along_m, self._v, self._omega = 0.0, 0.0, 0.0
@@ -140,26 +143,22 @@ class PathFollower:
 
     def _next_corner_m(self) -> float:
         """Distance to the next corner too sharp to be driven round at speed; infinite when there is none."""
-        for i in range(1, len(self._lengths)):
-            if self._starts[i] <= self._along_m:
-                continue
-            (ax, ay), (bx, by), (cx, cy) = self._points[i - 1 : i + 2]
-            if abs(wrap(math.atan2(cy - by, cx - bx) - math.atan2(by - ay, bx - ax))) > TURN_START_RAD:
-                return self._starts[i] - self._along_m
-        return math.inf
+        at = bisect_right(self._corners, self._along_m)
+        return self._corners[at] - self._along_m if at < len(self._corners) else math.inf
 
     def _project(self, pose: Pose) -> None:
         """Move the progress along the path to the nearest point of its next half metre; never back by much."""
         low_m, high_m = self._along_m - 0.05, self._along_m + 0.5
         best = (math.inf, self._along_m)
-        for (ax, ay), (bx, by), start_m, length_m in zip(
-            self._points, self._points[1:], self._starts, self._lengths, strict=False
-        ):
-            if start_m + length_m < low_m or start_m > high_m or length_m == 0.0:
+        for i in range(bisect_left(self._ends, low_m), bisect_right(self._starts, high_m)):
+            start_m, length_m = self._starts[i], self._lengths[i]
+            if length_m == 0.0:
                 continue
+            (ax, ay), (bx, by) = self._points[i], self._points[i + 1]
             share = ((pose[0] - ax) * (bx - ax) + (pose[1] - ay) * (by - ay)) / (length_m * length_m)
             along_m = min(max(start_m + share * length_m, max(low_m, start_m)), min(high_m, start_m + length_m))
-            best = min(best, (distance_m(pose, self._at(along_m)), along_m))
+            share = max(0.0, along_m - start_m) / length_m
+            best = min(best, (math.hypot(ax + share * (bx - ax) - pose[0], ay + share * (by - ay) - pose[1]), along_m))
         if best[0] < math.inf:
             self.off_path_m, self._along_m = best
         else:
@@ -167,12 +166,23 @@ class PathFollower:
 
     def _at(self, along_m: float) -> tuple[float, float]:
         """The point this far along; beyond the end it goes on straight, so that the end is met squarely."""
-        for i, length_m in enumerate(self._lengths):
-            if (along_m <= self._starts[i] + length_m or i == len(self._lengths) - 1) and length_m > 0.0:
+        last = len(self._lengths) - 1
+        for i in range(min(bisect_left(self._ends, along_m), last), last + 1):
+            if (length_m := self._lengths[i]) > 0.0:
                 (ax, ay), (bx, by) = self._points[i], self._points[i + 1]
                 share = max(0.0, along_m - self._starts[i]) / length_m
                 return ax + share * (bx - ax), ay + share * (by - ay)
         return self._points[-1]
+
+
+def _corners(points: list[tuple[float, float]], starts: list[float]) -> list[float]:
+    """How far along the sharp corners lie [m], in order."""
+    found = []
+    for i in range(1, len(starts)):
+        (ax, ay), (bx, by), (cx, cy) = points[i - 1 : i + 2]
+        if abs(wrap(math.atan2(cy - by, cx - bx) - math.atan2(by - ay, bx - ax))) > TURN_START_RAD:
+            found.append(starts[i])
+    return found
 
 
 def _spin(error_rad: float) -> float:
