@@ -101,7 +101,8 @@ def make_server(app: FastAPI) -> Server:
 def listen(host: str, port: int) -> socket.socket:
     """A bound socket (port 0: any free one); raises ConfigError that names the port."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    sock = socket.socket(family, socket.SOCK_STREAM)
+    # With the protocol named, asyncio switches Nagle's algorithm off on what is accepted: 40 ms an answer otherwise.
+    sock = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind((host, port))
