@@ -21,8 +21,8 @@ from console.folder import Folder
 from console.snapshot import all_tasks, look
 from core.clock import WallClock
 from core.errors import BadRequest, GardenError, NotFound, PeerDown
-from core.mesh.aio import AiohttpTransport
 from core.mesh.client import Mesh
+from core.mesh.http import HttpTransport
 from core.mesh.peers import Peer, PeerKind, Peers
 from core.wire.documents import Document
 from core.wire.market import Task, TaskRequest
@@ -54,7 +54,7 @@ class Line:
 async def open_line(data: Path, role: str = "") -> AsyncIterator[Line]:
     """With a `role`, requests carry that role's token."""
     folder = Folder(data)
-    mesh = Mesh(AiohttpTransport(), folder.identity(role) if role else None, WallClock(), timeout_s=3.0)
+    mesh = Mesh(HttpTransport(), folder.identity(role) if role else None, WallClock(), timeout_s=3.0)
     try:
         yield Line(mesh, Peers(folder.peers()))
     finally:

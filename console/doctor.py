@@ -26,7 +26,7 @@ from core.errors import GardenError
 from core.mesh.chassis import Readiness
 
 MARKS = {"ok": "[green]ok  [/green]", "note": "[yellow]note[/yellow]", "bad": "[red]BAD [/red]"}
-PACKAGES = ("numpy", "numba", "mujoco", "opencv-python-headless", "fastapi", "uvicorn", "aiohttp", "pyserial")
+PACKAGES = ("numpy", "numba", "mujoco", "opencv-python-headless", "fastapi", "uvicorn", "pydantic", "pyserial")
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,9 +24,9 @@ from console.runner import Runner
 from core import scenario as scenarios
 from core.clock import WallClock
 from core.errors import ConfigError, GardenError
-from core.mesh.aio import AiohttpTransport
 from core.mesh.chassis import Readiness
 from core.mesh.client import Mesh
+from core.mesh.http import HttpTransport
 from core.mesh.peers import Peer
 from core.scenario import Scenario
 from core.wire.documents import HistoryEntry
@@ -134,7 +134,7 @@ async def _up(wish: Wish, scenario: Scenario, listed: Sequence[Process]) -> None
 
 async def _greet(wish: Wish, scenario: Scenario, runner: Runner, voice: Voice) -> None:
     """Wait until everybody answers, say so, then tell what the pots tell."""
-    mesh = Mesh(AiohttpTransport(), None, WallClock(), timeout_s=5.0)
+    mesh = Mesh(HttpTransport(), None, WallClock(), timeout_s=5.0)
     peers = {peer.id: peer for peer in wish.folder.peers_written()}
     began_s = asyncio.get_running_loop().time()
     try:

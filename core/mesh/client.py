@@ -6,9 +6,8 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
-import httpx
 from pydantic import TypeAdapter, ValidationError
 
 from core.clock import Clock
@@ -31,6 +30,9 @@ from core.mesh.auth import Identity
 from core.mesh.peers import Peer
 from core.wire.documents import Document, Problem
 
+if TYPE_CHECKING:
+    import httpx
+
 D = TypeVar("D")
 T = TypeVar("T")
 ANSWER_BYTES_MAX = 4 * 1024 * 1024
@@ -48,7 +50,7 @@ class Answer:
 
 
 class PeerTransport(Protocol):
-    """Carries one request. `OSError` or `httpx.TransportError` mean that nobody answered."""
+    """Carries one request. An `OSError` means that nobody answered, or not in HTTP."""
 
     async def send(self, method: str, url: str, headers: Mapping[str, str], body: bytes) -> Answer: ...
 
@@ -62,16 +64,27 @@ class HttpxTransport:
         self._inner = inner
 
     async def send(self, method: str, url: str, headers: Mapping[str, str], body: bytes) -> Answer:
+        import httpx  # only tests and the lab need it: a pot's process stays small
+
         request = httpx.Request(method, url, headers=headers, content=body)
-        response = await self._inner.handle_async_request(request)
         try:
-            content = await response.aread()
-        finally:
-            await response.aclose()
+            response = await self._inner.handle_async_request(request)
+            try:
+                content = await response.aread()
+            finally:
+                await response.aclose()
+        except httpx.TransportError as error:
+            raise ConnectionError(str(error)) from error
         return Answer(response.status_code, content, {name.lower(): value for name, value in response.headers.items()})
 
     async def aclose(self) -> None:
         await self._inner.aclose()
+
+
+def _transport(given: PeerTransport | httpx.AsyncBaseTransport) -> PeerTransport:
+    if hasattr(given, "handle_async_request"):
+        return HttpxTransport(cast("httpx.AsyncBaseTransport", given))
+    return cast(PeerTransport, given)
 
 
 class Mesh:
@@ -84,8 +97,7 @@ class Mesh:
         clock: Clock,
         timeout_s: float = 2.0,
     ) -> None:
-        wrap = isinstance(transport, httpx.AsyncBaseTransport)
-        self._transport: PeerTransport = HttpxTransport(transport) if wrap else transport  # type: ignore[arg-type, assignment]
+        self._transport = _transport(transport)
         self._headers = {"authorization": f"Bearer {identity.token}"} if identity else {}
         self._clock = clock
         self._timeout_s = timeout_s
@@ -127,7 +139,7 @@ class Mesh:
                 return await self._transport.send(method, peer.url + path, sent, body)
         except TimeoutError as error:
             raise PeerDown(f"{peer.id} did not answer {method} {path} within {limit_s:g} s") from error
-        except (OSError, httpx.TransportError, EOFError) as error:
+        except OSError as error:
             raise PeerDown(f"{peer.id} is not reachable at {peer.url}: {error or type(error).__name__}") from error
 
     async def ask_all(

@@ -71,14 +71,14 @@ def make_clock(settings: GardenSettings) -> tuple[Clock, Sequence[Loop]]:
 
 def make_runtime(settings: GardenSettings | None = None) -> Runtime:
     """Call inside the running loop; raises ConfigError for missing or broken key files."""
-    from core.mesh.aio import AiohttpTransport
+    from core.mesh.http import HttpTransport
 
     settings = settings or GardenSettings()
     clock, clock_loops = make_clock(settings)
     if settings.keys is None:
         raise ConfigError("GARDEN_KEYS names no key folder", hint="run `garden init`, then set GARDEN_KEYS=DATA/keys/NODE")
     identity, verifier = Identity.load(settings.keys), Verifier.load(settings.keys)
-    return Runtime(settings, clock, clock_loops, identity, verifier, Peers(settings.peers), AiohttpTransport())
+    return Runtime(settings, clock, clock_loops, identity, verifier, Peers(settings.peers), HttpTransport())
 
 
 def setup_logging(how: str = "auto") -> None:

@@ -15,9 +15,9 @@ from typing import Any
 import httpx
 
 from core.clock import WallClock
-from core.mesh.aio import AiohttpTransport
 from core.mesh.auth import GardenKey
 from core.mesh.client import Mesh
+from core.mesh.http import HttpTransport
 from core.mesh.peers import Peer
 from core.wire.geometry import Point3, Pose2
 from core.wire.market import Announcement, Bid, PlantCard
@@ -61,7 +61,7 @@ async def _bench(peers: Sequence[Peer], n: int) -> list[Row]:
     rows: list[Row] = []
     for size, target_ms in SIZES.items():
         asked = peers[:size]
-        mesh = Mesh(AiohttpTransport(), IDENTITY, WallClock(), timeout_s=30.0)
+        mesh = Mesh(HttpTransport(), IDENTITY, WallClock(), timeout_s=30.0)
         async with httpx.AsyncClient(timeout=30.0, limits=httpx.Limits(max_keepalive_connections=size)) as client:
             lost: list[str] = []
             ours, theirs = _ours(mesh, asked), _theirs(client, asked, lost)

@@ -13,10 +13,10 @@ import pytest
 from core.clock import WallClock
 from core.errors import ConfigError, PeerDown
 from core.mesh import server as server_module
-from core.mesh.aio import AiohttpTransport
 from core.mesh.chassis import Health, body, create_app
 from core.mesh.client import Mesh
 from core.mesh.events import EventLog
+from core.mesh.http import HttpTransport
 from core.mesh.node import Node, serve
 from core.mesh.peers import Peer
 from core.mesh.server import listen
@@ -98,7 +98,7 @@ def test_two_lengths_are_refused_on_the_wire() -> None:
 
 def test_the_real_transport_reaches_the_real_server_and_events_stream() -> None:
     async def story(port: int) -> None:
-        transport = AiohttpTransport()
+        transport = HttpTransport()
         mesh = Mesh(transport, None, WallClock())
         peer = Peer(id="pot", kind="plant", url=f"http://127.0.0.1:{port}")
         assert await mesh.call(peer, "GET", "/healthz", expect=Health) == Health()

@@ -1,0 +1,292 @@
+"""The mesh's real transport: a small HTTP/1.1 client that keeps a connection or more to each peer.
+
+One request is one write and one future, which is what makes asking 200 robots at once cheap. Answers may have a length,
+be chunked (RFC 9112, section 7.1) or end with the connection; whatever is not HTTP is an OSError, as silence is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import ssl
+from collections.abc import Mapping
+from dataclasses import dataclass
+from urllib.parse import quote, urlsplit
+
+from core.errors import BadRequest
+from core.mesh.client import ANSWER_BYTES_MAX, Answer
+
+KEPT_S = 25.0
+"""Shorter than our servers keep an idle connection, so that no request meets one that is closing."""
+HEAD_BYTES_MAX = 64 * 1024
+_SAFE = re.compile(r"[A-Za-z0-9/%:=&?~+!$,;'@()*._-]*")
+_CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
+_STATUS = re.compile(rb"HTTP/1\.[01] ([1-5][0-9][0-9])(?: |$)")
+
+
+@dataclass(frozen=True, slots=True)
+class _Target:
+    """A URL, taken apart once."""
+
+    place: tuple[str, int, bool]
+    """Host, port, with TLS."""
+    start: str
+    """What follows the method in a request's first lines."""
+
+
+class HttpTransport:
+    """A PeerTransport over TCP. The caller holds the time-out; an abandoned request closes its connection."""
+
+    def __init__(self, tls: ssl.SSLContext | None = None) -> None:
+        self._tls = tls
+        self._idle: dict[tuple[str, int, bool], list[_Connection]] = {}
+        self._targets: dict[str, _Target] = {}
+        self._open: set[_Connection] = set()
+
+    async def send(self, method: str, url: str, headers: Mapping[str, str], body: bytes) -> Answer:
+        target = self._target(url)
+        data = _request(method, target, headers, body)
+        connection = self._kept(target.place)
+        if connection is not None:
+            try:
+                return await self._exchange(connection, target.place, method, data)
+            except ConnectionResetError:
+                # It was closing while we wrote: a GET may simply be asked again, on a new connection.
+                if method != "GET":
+                    raise
+        return await self._exchange(await self._connect(target.place), target.place, method, data)
+
+    async def aclose(self) -> None:
+        for connection in list(self._open):
+            connection.close()
+        self._idle.clear()
+        await asyncio.sleep(0)
+
+    async def _exchange(self, connection: _Connection, place: tuple[str, int, bool], method: str, data: bytes) -> Answer:
+        try:
+            answer = await connection.ask(data, method == "HEAD")
+        except BaseException:
+            connection.close()
+            raise
+        if connection.reusable:
+            self._idle.setdefault(place, []).append(connection)
+        else:
+            connection.close()
+        return answer
+
+    def _kept(self, place: tuple[str, int, bool]) -> _Connection | None:
+        """A connection that is open and not too old; the youngest first."""
+        idle = self._idle.get(place)
+        now_s = asyncio.get_running_loop().time()
+        while idle:
+            connection = idle.pop()
+            if connection.reusable and now_s - connection.used_s < KEPT_S:
+                return connection
+            connection.close()
+        return None
+
+    async def _connect(self, place: tuple[str, int, bool]) -> _Connection:
+        host, port, tls = place
+        loop = asyncio.get_running_loop()
+        context = (self._tls or ssl.create_default_context()) if tls else None
+        _, connection = await loop.create_connection(lambda: _Connection(self._open), host, port, ssl=context)
+        return connection
+
+    def _target(self, url: str) -> _Target:
+        target = self._targets.get(url)
+        if target is None:
+            if len(self._targets) > 2000:
+                self._targets.clear()
+            target = self._targets[url] = _parsed(url)
+        return target
+
+
+def _parsed(url: str) -> _Target:
+    parts = urlsplit(url)
+    tls = parts.scheme == "https"
+    if parts.scheme not in ("http", "https") or not parts.hostname:
+        raise BadRequest(f"{url!r} is no http address")
+    what = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+    if not _SAFE.fullmatch(what):
+        what = quote(what, safe="/%:=&?~+!$,;'@()*._-")
+    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
+    port = parts.port or (443 if tls else 80)
+    return _Target((parts.hostname, port, tls), f" {what} HTTP/1.1\r\nhost: {host}:{port}\r\n")
+
+
+def _request(method: str, target: _Target, headers: Mapping[str, str], body: bytes) -> bytes:
+    lines = [method, target.start]
+    for name, value in headers.items():
+        if _CONTROL.search(value):
+            raise BadRequest(f"the header {name} holds a control character")
+        lines += (name, ": ", value, "\r\n")
+    if body or method not in ("GET", "HEAD", "DELETE"):
+        lines.append(f"content-length: {len(body)}\r\n")
+    lines.append("\r\n")
+    return "".join(lines).encode("latin-1", "replace") + body
+
+
+class _Connection(asyncio.Protocol):
+    """One request at a time."""
+
+    def __init__(self, open_: set[_Connection]) -> None:
+        self._open = open_
+        self._transport: asyncio.Transport | None = None
+        self._waiting: asyncio.Future[Answer] | None = None
+        self._reader = _Reader(headless=False)
+        self.used_s = 0.0
+        self.reusable = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        self._open.add(self)
+
+    async def ask(self, data: bytes, headless: bool) -> Answer:
+        loop = asyncio.get_running_loop()
+        if self._transport is None or self._transport.is_closing():
+            raise ConnectionResetError("the connection was closed")
+        self.reusable = False
+        self._reader = _Reader(headless)
+        self._waiting = loop.create_future()
+        self._transport.write(data)
+        answer = await self._waiting
+        self.used_s = loop.time()
+        return answer
+
+    def data_received(self, data: bytes) -> None:
+        waiting = self._waiting
+        if waiting is None or waiting.done():
+            self.close()  # bytes that nobody asked for
+            return
+        try:
+            answer = self._reader.feed(data)
+        except ValueError as error:
+            waiting.set_exception(ConnectionError(f"the answer is not HTTP: {error}"))
+            self.close()
+            return
+        if answer is not None:
+            self.reusable = self._reader.keep
+            waiting.set_result(answer)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.reusable = False
+        self._open.discard(self)
+        waiting = self._waiting
+        if waiting is None or waiting.done():
+            return
+        answer = self._reader.at_end()
+        if answer is not None:
+            waiting.set_result(answer)
+        elif self._reader.begun:
+            waiting.set_exception(ConnectionError("the answer broke off"))
+        else:
+            waiting.set_exception(ConnectionResetError(str(exc or "the connection was closed without an answer")))
+
+    def close(self) -> None:
+        self.reusable = False
+        if self._transport is not None:
+            self._transport.abort()
+
+
+class _Reader:
+    """One answer out of bytes that come in pieces; raises ValueError for what is not HTTP."""
+
+    def __init__(self, headless: bool) -> None:
+        self._headless = headless
+        """The answer to a HEAD: lengths are told, bytes are not."""
+        self._data = bytearray()
+        self._status = 0
+        self._headers: dict[str, str] = {}
+        self._left: int | None = None
+        """Bytes of the body still to come; None: until the connection ends."""
+        self._chunks: bytearray | None = None
+        self.keep = False
+        self.begun = False
+
+    def feed(self, data: bytes) -> Answer | None:
+        self.begun = True
+        self._data += data
+        while self._status == 0:
+            end = self._data.find(b"\r\n\r\n")
+            if end < 0:
+                if len(self._data) > HEAD_BYTES_MAX:
+                    raise ValueError("its head is too long")
+                return None
+            self._read_head(bytes(self._data[:end]))
+            del self._data[: end + 4]
+        return self._body()
+
+    def at_end(self) -> Answer | None:
+        """The answer when the connection ended: only one that was to be read to the end is whole."""
+        if self._status and self._left is None and self._chunks is None:
+            return Answer(self._status, bytes(self._data), self._headers)
+        return None
+
+    def _read_head(self, head: bytes) -> None:
+        first, *lines = head.split(b"\r\n")
+        if (matched := _STATUS.match(first)) is None:
+            raise ValueError(f"it begins with {first[:40]!r}")
+        status = int(matched[1])
+        if status < 200:
+            return  # a word on the way; the answer follows
+        for line in lines:
+            name, colon, value = line.partition(b":")
+            if not colon or not name or name != name.strip():
+                raise ValueError("a header line without a name")
+            self._headers[name.decode("latin-1").lower()] = value.strip().decode("latin-1")
+        self._status = status
+        self._measure(first.startswith(b"HTTP/1.1"))
+
+    def _measure(self, modern: bool) -> None:
+        headers = self._headers
+        self.keep = modern and headers.get("connection", "").lower() != "close"
+        if self._headless or self._status in (204, 304):
+            self._left = 0
+        elif headers.get("transfer-encoding", "").lower() == "chunked":
+            self._chunks = bytearray()
+        elif (length := headers.get("content-length")) is not None:
+            if not length.isascii() or not length.isdigit():
+                raise ValueError("its length is not a number")
+            self._left = int(length)
+            self._check_size(self._left)
+        else:
+            self.keep = False
+
+    def _body(self) -> Answer | None:
+        if self._chunks is not None:
+            return self._chunked(self._chunks)
+        self._check_size(len(self._data))
+        if self._left is None or len(self._data) < self._left:
+            return None
+        self.keep = self.keep and len(self._data) == self._left
+        return Answer(self._status, bytes(self._data[: self._left]), self._headers)
+
+    def _chunked(self, whole: bytearray) -> Answer | None:
+        while (line_end := self._data.find(b"\r\n")) >= 0:
+            size = _chunk_size(bytes(self._data[:line_end]))
+            end = line_end + 2 + size + 2
+            self._check_size(len(whole) + size)
+            if len(self._data) < end:
+                return None
+            if self._data[end - 2 : end] != b"\r\n":
+                raise ValueError("a chunk does not end where it should (or trailers follow)")
+            whole += self._data[line_end + 2 : end - 2]
+            del self._data[:end]
+            if size == 0:
+                self.keep = self.keep and not self._data
+                return Answer(self._status, bytes(whole), self._headers)
+        if len(self._data) > 1000:
+            raise ValueError("a chunk without a size")
+        return None
+
+    def _check_size(self, size: int) -> None:
+        if size > ANSWER_BYTES_MAX:
+            raise ValueError(f"it is longer than {ANSWER_BYTES_MAX} bytes")
+
+
+def _chunk_size(line: bytes) -> int:
+    digits = line.partition(b";")[0].strip()
+    if not re.fullmatch(rb"[0-9A-Fa-f]{1,8}", digits):
+        raise ValueError("a chunk's size is not a number")
+    return int(digits, 16)
