@@ -41,7 +41,9 @@ def moist(plant: Plant) -> Plant:
     return plant.model_copy(update={"moisture_ratio": MOIST_RATIO})
 
 
-def garden_of(dry_pots: tuple[str, ...], moist_pots: tuple[str, ...] = (), robots: tuple[Robot, ...] | None = None) -> Scenario:
+def garden_of(
+    dry_pots: tuple[str, ...], moist_pots: tuple[str, ...] = (), robots: tuple[Robot, ...] | None = None
+) -> Scenario:
     """The default garden with only these pots, and these robots if given."""
     base = find("garden")
     kept = [p for p in base.plants if p.id in dry_pots + moist_pots]
@@ -133,7 +135,10 @@ async def standing(garden: Garden) -> str:
             lines += [_told(task) for task in await tasks(garden, name)]
         elif running.process.kind == "robot":
             state = await garden.get(name, "/state")
-            lines.append(f"{name}: " + ", ".join(f"{k} {state[k]}" for k in ("job", "waiting", "down", "docked_at", "stopped", "tank_ml")))
+            lines.append(
+                f"{name}: "
+                + ", ".join(f"{k} {state[k]}" for k in ("job", "waiting", "down", "docked_at", "stopped", "tank_ml"))
+            )
             lines += [f"   {e['t_s']:.1f} {e['what']}" for e in (await garden.get(name, "/history"))[-12:]]
     return "\n".join(lines)
 

@@ -14,7 +14,11 @@ from robot_service.robot import Robot, SkillFailed
 from robot_service.skills.dock import dock_at, insist
 
 LOOK_EVERY_S = 2.0
-FULL_ML = 0.985 * gardener.TANK_ML
+AIM_ML = gardener.TANK_ML - 20.0
+"""Fill to here: the sensor's steps and noise stay below the brim."""
+FULL_ML = AIM_ML - 20.0
+READ_S = 2.0
+"""A resting board tells a new level at least this often."""
 FIRST_OPEN_S = 10.0
 TAP_STALL_S = 15.0
 CHARGE_S_MAX = 4 * 3600.0
@@ -82,7 +86,7 @@ async def _fill(robot: Robot, dock: KnownDock) -> None:
         except GardenError as error:
             dry = f"the tap refuses: {error}"
             grant = None
-        await robot.pause(grant.open_s + 0.5 if grant else 2.0)
+        await robot.pause((grant.open_s if grant else 0.0) + READ_S)
         now_ml = _tank(robot)
         if now_ml > level_ml + 2.0:
             risen_s = robot.clock.now()
@@ -90,7 +94,7 @@ async def _fill(robot: Robot, dock: KnownDock) -> None:
         if robot.clock.now() - risen_s > TAP_STALL_S:
             raise SkillFailed(dry or f"the tank does not fill beyond {level_ml:.0f} ml")
         if grant is not None:
-            open_s = min(30.0, max(0.5, (gardener.TANK_ML - level_ml) / grant.flow_mlps))
+            open_s = min(30.0, max(0.5, (AIM_ML - level_ml) / grant.flow_mlps))
 
 
 async def _open(robot: Robot, dock: KnownDock, open_s: float) -> TapGrant:
