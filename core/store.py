@@ -29,6 +29,9 @@ COMMIT_COST_S = 0.001
 _HEADER = re.compile(rb'\{"schema":"([a-z0-9_./-]+)","generation":([1-9][0-9]{0,17}),"sha256":"([0-9a-f]{64})","doc":')
 _log = logging.getLogger(__name__)
 
+Content = bytes | Mapping[str, Any] | Callable[[], bytes]
+"""JSON text, what becomes it, or what makes it: called off the loop, and only for the newest of a commit."""
+
 
 class Disk:
     """The operating system's file calls, one method each, so that a test can bring a worse disk."""
@@ -103,7 +106,9 @@ def _digest(schema: str, generation: int, doc: bytes) -> str:
     return hashlib.sha256(f"{schema}\n{generation}\n".encode() + doc).hexdigest()
 
 
-def _encode(doc: bytes | Mapping[str, Any]) -> bytes:
+def _encode(doc: Content) -> bytes:
+    if callable(doc):
+        return doc()
     if isinstance(doc, bytes):
         return doc
     return json.dumps(doc, separators=(",", ":"), allow_nan=False).encode()
@@ -124,7 +129,7 @@ class DurableDocument:
         """Commits that failed; whoever keeps the document in memory goes back to the last durable one."""
         self._clock, self._disk = clock, disk or Disk()
         self._lock: IO[str] | None = None
-        self._queue: list[tuple[bytes | Mapping[str, Any], asyncio.Future[int]]] = []
+        self._queue: list[tuple[Content, asyncio.Future[int]]] = []
         self._writer: asyncio.Task[None] | None = None
 
     def load(self) -> Any:
@@ -147,10 +152,10 @@ class DurableDocument:
             self._reinstate()
         return json.loads(best.doc)
 
-    async def save(self, doc: bytes | Mapping[str, Any]) -> int:
+    async def save(self, doc: Content) -> int:
         """Returns the generation when this document, or one saved after it, is durable; raises StorageError.
 
-        Bytes must be JSON text. The document must not change while it is being saved.
+        The document must not change while it is being saved.
         """
         if self.broken:
             self.failures += 1
@@ -182,7 +187,7 @@ class DurableDocument:
                 _settle(batch, generation)
         self._writer = None
 
-    def commit(self, doc: bytes | Mapping[str, Any]) -> int:
+    def commit(self, doc: Content) -> int:
         """The recipe itself, blocking; `save` calls it off the loop. One caller at a time."""
         if self._lock is None:
             raise StorageError(f"{self.path.name} is closed")
@@ -271,7 +276,7 @@ class DurableDocument:
         _log.error("damaged document put aside: %s (%s) as %s", path, why, aside.name)
 
 
-def _settle(batch: list[tuple[bytes | Mapping[str, Any], asyncio.Future[int]]], answer: int | StorageError) -> None:
+def _settle(batch: list[tuple[Content, asyncio.Future[int]]], answer: int | StorageError) -> None:
     for _, done in batch:
         if done.done():
             continue

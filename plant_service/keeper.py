@@ -60,7 +60,7 @@ class Keeper(Generic[M, D]):
         document: D = machine.document()
         self._saving += 1
         try:
-            await self._file.save(document.model_dump_json().encode())
+            await self._file.save(lambda: document.model_dump_json().encode())
         finally:
             self._saving -= 1
         self.durable = document
