@@ -288,8 +288,7 @@ class Market:
 
     def _close_award(self, task: Task, live: Live, bids: list[Bid], now_s: float) -> None:
         if (best := cheapest(bids)) is None:
-            self._nobody(task, live, bids, now_s)
-            return
+            return self._nobody(task, live, bids, now_s)
         live.told, live.backoff_s = "", 0.0
         cost_s = best.cost_s or 0.0
         self._award(task, best.robot_id, cost_s, bids, f"cheapest of {len(bids)}: {cost_s:.1f} s", now_s)
