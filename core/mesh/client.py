@@ -84,7 +84,7 @@ class HttpxTransport:
 def _transport(given: PeerTransport | httpx.AsyncBaseTransport) -> PeerTransport:
     if hasattr(given, "handle_async_request"):
         return HttpxTransport(cast("httpx.AsyncBaseTransport", given))
-    return cast(PeerTransport, given)
+    return given
 
 
 class Mesh:
