@@ -18,6 +18,7 @@ from core.scenario import Plant, Robot, Scenario, find
 from core.virtual import run_virtual
 from core.wire.market import FINAL_STATES
 from lab.garden import Garden
+from sim.faults import Fault, FaultRequest
 from sim.truth import RobotTruth
 
 DRY_RATIO, MOIST_RATIO = 0.175, 0.35
@@ -125,6 +126,9 @@ async def phase(garden: Garden, plant_id: str, *words: str, within_s: float = 12
     return found
 
 
+_SHOWN = ("job", "waiting", "down", "docked_at", "stopped", "battery_ratio", "tank_ml")
+
+
 async def standing(garden: Garden) -> str:
     """How everything stands, for a failed assertion."""
     lines = [f"t {garden.clock.now():.1f} s"]
@@ -135,10 +139,7 @@ async def standing(garden: Garden) -> str:
             lines += [_told(task) for task in await tasks(garden, name)]
         elif running.process.kind == "robot":
             state = await garden.get(name, "/state")
-            lines.append(
-                f"{name}: "
-                + ", ".join(f"{k} {state[k]}" for k in ("job", "waiting", "down", "docked_at", "stopped", "tank_ml"))
-            )
+            lines.append(f"{name}: " + ", ".join(f"{key} {state[key]}" for key in _SHOWN))
             lines += [f"   {e['t_s']:.1f} {e['what']}" for e in (await garden.get(name, "/history"))[-12:]]
     return "\n".join(lines)
 
@@ -146,6 +147,24 @@ async def standing(garden: Garden) -> str:
 def _told(task: dict[str, Any]) -> str:
     story = [f"   {e['t_s']:.1f} {e['what']}" for e in task["events"]]
     return "\n".join([f"  {task['task_id']} {task['state']} {task['phase']!r}", *story])
+
+
+async def said(garden: Garden, name: str, *words: str, within_s: float = 60.0) -> dict[str, Any]:
+    """Wait until a service's `/state` holds one of `words` in `waiting`, `down` or the probe's `why`."""
+    state: dict[str, Any] = {}
+
+    async def so() -> bool:
+        state.update(await garden.get(name, "/state"))
+        told = " ".join([state["waiting"], *state.get("down", ()), state.get("soil", {}).get("why", "")])
+        return any(word in told for word in words)
+
+    assert await garden.until(so, within_s, every_s=0.2), f"{name} never said {words}: {await standing(garden)}"
+    return state
+
+
+def fault(garden: Garden, kind: str, target: str, for_s: float | None = None, strength: float | None = None) -> Fault:
+    """Bring a fault about, now."""
+    return garden.rig.faults.add(FaultRequest(kind=kind, target=target, duration_s=for_s, strength=strength))
 
 
 # ------------------------------------------------------------------ the judge
