@@ -6,7 +6,7 @@ import asyncio
 from pathlib import Path as FilePath
 from typing import Annotated, TypeVar
 
-from fastapi import FastAPI, Header, Path
+from fastapi import FastAPI, Header, Path, Query
 from starlette.responses import Response
 
 from console.snapshot import Snapshot, look
@@ -85,7 +85,7 @@ def _add_reads(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
         return await glance.now()
 
     @app.get("/overview.jpg", tags=["garden"], summary="The simulated world from above", response_class=Response)
-    async def overview() -> Response:
+    async def overview(t: Annotated[int, Query(description="any number: makes the address a new one")] = 0) -> Response:
         worlds = peers.of_kind("sim")
         if not worlds:
             raise NotFound("a real garden has no simulated world", hint="look out of the window")
@@ -111,8 +111,8 @@ def _add_buttons(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
     @app.post("/api/stop", tags=["buttons"], summary="Stop every robot")
     async def stop(
         authorization: Token = "",
-        request: StopRequest = body(StopRequest),
         caller: Caller = allow("plant", "robot", "operator", "viewer"),
+        request: StopRequest = body(StopRequest),
     ) -> Answers:
         return await all_robots("/stop", request.model_dump_json().encode(), authorization)
 
@@ -124,11 +124,14 @@ def _add_buttons(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
     async def water(
         plant_id: Name,
         authorization: Token = "",
-        request: TaskRequest = body(TaskRequest),
         caller: Caller = allow("operator"),
+        request: TaskRequest = body(TaskRequest),
     ) -> Task:
+        pots = peers.of_kind("plant")
+        if (pot := next((pot for pot in pots if pot.id == plant_id), None)) is None:
+            raise NotFound(f"no plant {plant_id!r}", hint=f"known: {', '.join(pot.id for pot in pots) or 'none'}")
         content = request.model_dump_json().encode()
-        return await _pass_on(mesh, peers.get(plant_id), "/tasks", content, authorization, Task)
+        return await _pass_on(mesh, pot, "/tasks", content, authorization, Task)
 
 
 async def _pass_on(mesh: Mesh, peer: Peer, path: str, content: bytes, token: str, expect: type[D]) -> D:

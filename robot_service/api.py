@@ -6,14 +6,16 @@ import csv
 import io
 from typing import Annotated
 
-from fastapi import FastAPI, Query, Response
+from fastapi import FastAPI, Path, Query, Response
 
 from core.mesh.auth import ROLES, Caller, Verifier
 from core.mesh.chassis import allow, body, create_app
 from core.wire.documents import HistoryEntry
 from core.wire.market import Announcement, Award, Bid
 from core.wire.robot import Job, JobRequest, Position, QueuedTask, RobotState, Stopped, StopRequest
-from robot_service.brain import Brain, queued
+from robot_service.brain import Brain, check_owner, queued
+
+Id = Annotated[str, Path(max_length=80)]
 
 
 def make_app(brain: Brain, verifier: Verifier | None, open_reads: bool = True) -> FastAPI:
@@ -34,7 +36,8 @@ def make_app(brain: Brain, verifier: Verifier | None, open_reads: bool = True) -
 
 def _market(app: FastAPI, brain: Brain) -> None:
     @app.post("/bids", summary="Announcement in, bid out", tags=["market"])
-    async def bid(asked: Announcement = body(Announcement), caller: Caller = allow("plant", "operator")) -> Bid:
+    async def bid(caller: Caller = allow("plant", "operator"), asked: Announcement = body(Announcement)) -> Bid:
+        check_owner(asked, caller)
         return await brain.bid(asked)
 
     @app.get("/tasks", summary="The queue", tags=["market"])
@@ -42,15 +45,15 @@ def _market(app: FastAPI, brain: Brain) -> None:
         return [queued(entry) for entry in brain.queue.entries if entry.kind != "job"]
 
     @app.post("/tasks", summary="Award", tags=["market"], status_code=201)
-    async def award(award: Award = body(Award), caller: Caller = allow("plant", "operator")) -> QueuedTask:
+    async def award(caller: Caller = allow("plant", "operator"), award: Award = body(Award)) -> QueuedTask:
         return brain.award(award, caller)
 
     @app.get("/tasks/{task_id:path}", summary="One task of the queue", tags=["market"])
-    async def task(task_id: str) -> QueuedTask:
+    async def task(task_id: Id) -> QueuedTask:
         return queued(brain.queue.get(task_id))
 
     @app.delete("/tasks/{task_id:path}", summary="Kill task", tags=["market"])
-    async def kill(task_id: str, caller: Caller = allow("plant", "operator")) -> QueuedTask:
+    async def kill(task_id: Id, caller: Caller = allow("plant", "operator")) -> QueuedTask:
         return brain.kill(task_id, caller)
 
 
@@ -82,7 +85,7 @@ def _csv(entries: list[HistoryEntry]) -> Response:
 
 def _jobs(app: FastAPI, brain: Brain) -> None:
     @app.post("/jobs", summary="A job from a supervisor", tags=["operator"], status_code=202)
-    async def post_job(response: Response, wish: JobRequest = body(JobRequest), caller: Caller = allow("operator")) -> Job:
+    async def post_job(response: Response, caller: Caller = allow("operator"), wish: JobRequest = body(JobRequest)) -> Job:
         job = brain.add_job(wish)
         response.headers["location"] = f"/jobs/{job.job_id}"
         return job
@@ -92,17 +95,17 @@ def _jobs(app: FastAPI, brain: Brain) -> None:
         return brain.reporter.all_jobs()
 
     @app.get("/jobs/{job_id:path}", summary="How a job stands", tags=["operator"])
-    async def get_job(job_id: str) -> Job:
+    async def get_job(job_id: Id) -> Job:
         return brain.reporter.job(job_id)
 
     @app.delete("/jobs/{job_id:path}", summary="Call a job off", tags=["operator"])
-    async def delete_job(job_id: str, caller: Caller = allow("operator")) -> Job:
+    async def delete_job(job_id: Id, caller: Caller = allow("operator")) -> Job:
         return brain.call_off(job_id, caller)
 
 
 def _emergency(app: FastAPI, brain: Brain) -> None:
     @app.post("/stop", summary="E-stop: latches", tags=["safety"])
-    async def stop(wish: StopRequest = body(StopRequest), caller: Caller = allow(*ROLES)) -> Stopped:
+    async def stop(caller: Caller = allow(*ROLES), wish: StopRequest = body(StopRequest)) -> Stopped:
         return await brain.stop(caller, wish.reason)
 
     @app.post("/resume", summary="Release the e-stop", tags=["safety"])

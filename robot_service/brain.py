@@ -7,6 +7,7 @@ import random
 import httpx
 
 from core.allocation.bidding import Condition, Stop, price, work_s
+from core.allocation.epochs import owner_of
 from core.allocation.queue import Entry, TaskQueue
 from core.clock import Clock
 from core.errors import Forbidden, Unavailable, Unprocessable
@@ -36,6 +37,7 @@ from robot_service.settings import RobotSettings
 
 TURNING_S = 3.0
 STOP_ANSWER_S = 2.0
+STOPPED_BY_CHARS = 200
 DRIVE_RATIO = 1.15
 """Driven time over length / cruise: corners and braking."""
 
@@ -216,8 +218,7 @@ class Brain:
     def award(self, award: Award, caller: Caller) -> QueuedTask:
         """Take a task; raises Forbidden for another plant's, Refused for a stale epoch."""
         plant_id = award.announcement.plant.plant_id
-        if caller.role == "plant" and caller.subject != plant_id:
-            raise Forbidden(f"{caller.subject} cannot award a task of {plant_id}")
+        check_owner(award.announcement, caller)
         if self.robot.peers.find(plant_id) is None or self.settings.map.dock(plant_id) is None:
             raise Unprocessable(f"{plant_id} is not a plant we know")
         if award.announcement.kind not in self.settings.capabilities:
@@ -232,7 +233,8 @@ class Brain:
         """Kill task; a plant only its own."""
         entry = self.queue.get(task_id)
         if caller.role == "plant" and caller.subject != entry.plant_id:
-            raise Forbidden(f"{task_id} is a task of {entry.plant_id or self.settings.id}")
+            owner = entry.plant_id or self.settings.id
+            raise Forbidden(f"{task_id} is a task of {owner}", hint=f"only {owner} or an operator kills it")
         self.scheduler.kill(entry, f"killed by {caller.subject}")
         return queued(entry)
 
@@ -268,7 +270,8 @@ class Brain:
     async def stop(self, caller: Caller, reason: str) -> Stopped:
         """Latch the e-stop in the body; answers once the body says so."""
         began_s = self.clock.now()
-        self.body.order("stop", f"{caller.subject}: {reason}" if reason else caller.subject)
+        # Told again in bids, reports and reasons for waiting, which are sentences of their own.
+        self.body.order("stop", f"{caller.subject}: {reason}"[:STOPPED_BY_CHARS] if reason else caller.subject)
         await self._until(stopped=True)
         return self._stop_state(began_s)
 
@@ -296,6 +299,15 @@ class Brain:
             by="" if state is None else state.stopped_by,
             after_s=max(0.0, self.clock.now() - began_s),
         )
+
+
+def check_owner(asked: Announcement, caller: Caller) -> None:
+    """A plant speaks of its own tasks only: whoever could name another's could outbid its epochs. Raises Forbidden."""
+    plant_id = asked.plant.plant_id
+    if caller.role == "plant" and caller.subject != plant_id:
+        raise Forbidden(f"{caller.subject} cannot offer a task of {plant_id}", hint="offer your own tasks")
+    if (owner := owner_of(asked.task_id)) not in ("", plant_id):
+        raise Forbidden(f"{asked.task_id} is a task of {owner}, not of {plant_id}", hint="offer tasks under your own ids")
 
 
 def queued(entry: Entry) -> QueuedTask:

@@ -49,7 +49,7 @@ class ClockState(Document):
 class ClockPatch(Document):
     """`PATCH /clock`."""
 
-    speed: Annotated[float, Field(gt=0, le=100)] | None = None
+    speed: Annotated[float, Field(ge=0.01, le=100)] | None = None
     paused: bool | None = None
 
 
@@ -212,7 +212,7 @@ def _clock_routes(app: FastAPI, rig: Rig, events: EventLog) -> None:
         return StreamingResponse(lines(), media_type="application/x-ndjson", headers={"cache-control": "no-store"})
 
     @app.patch("/clock", summary="Change the speed, pause, go on", tags=["clock"])
-    async def patch(change: ClockPatch = body(ClockPatch), caller: Caller = allow("operator")) -> ClockState:
+    async def patch(caller: Caller = allow("operator"), change: ClockPatch = body(ClockPatch)) -> ClockState:
         if change.speed is None and change.paused is None:
             raise Unprocessable("nothing to change", hint='send {"speed": 5} or {"paused": true}')
         rig.clockwork.steer(speed=change.speed, paused=change.paused)
@@ -226,7 +226,7 @@ def _fault_routes(app: FastAPI, rig: Rig, events: EventLog) -> None:
         return rig.faults.all()
 
     @app.post("/faults", status_code=201, summary=f"Bring one about: {', '.join(KINDS)}", tags=["faults"])
-    async def add(request: FaultRequest = body(FaultRequest), caller: Caller = allow("operator")) -> Fault:
+    async def add(caller: Caller = allow("operator"), request: FaultRequest = body(FaultRequest)) -> Fault:
         rig.clockwork.catch_up()
         fault = rig.faults.add(request)
         rig.clockwork.wake()

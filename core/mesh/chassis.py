@@ -21,7 +21,7 @@ from core.mesh.describe import describe, docs_page
 from core.mesh.events import EventLog
 from core.mesh.guard import Guard, bearer
 from core.mesh.problems import problem_response
-from core.mesh.strict import body, parse
+from core.mesh.strict import body, no_surplus, parse
 from core.wire.documents import Document, HistoryEntry, NodeCard
 
 SSE_SILENCE_S = 15.0
@@ -86,7 +86,14 @@ def create_app(
     and the same again. A browser that asks for `/` gets `page`, if there is one.
     `app.state` holds clock, verifier, events and registry.
     """
-    app = FastAPI(title="Robot Garden", version=version(), docs_url=None, redoc_url=None)
+    app = FastAPI(
+        title="Robot Garden",
+        version=version(),
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        dependencies=[Depends(no_surplus)],
+    )
     registry = registry if registry is not None else CollectorRegistry()
     app.state.clock, app.state.verifier, app.state.events, app.state.registry = clock, verifier, events, registry
     app.add_middleware(
@@ -112,14 +119,13 @@ def _refusals(app: FastAPI) -> None:
 
     async def on_http_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
-        hint = {404: "GET /openapi.json lists what there is", 405: "another method may do"}.get(error.status_code, "")
         headers = dict(error.headers or {})
-        return problem_response(request.scope, error.status_code, "", str(error.detail), hint, headers)
+        return problem_response(request.scope, error.status_code, "", str(error.detail), headers=headers)
 
     async def on_parameters(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
         told = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:8])
-        return problem_response(request.scope, 422, "", told[:1000], "see /docs")
+        return problem_response(request.scope, 422, "", told)
 
     app.add_exception_handler(GardenError, on_garden_error)
     app.add_exception_handler(HTTPException, on_http_error)

@@ -19,10 +19,10 @@ CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 
 
 def routes(app: FastAPI) -> Iterator[tuple[str, str, Any]]:
-    """Every (method, path, route) of an app, included routers as well."""
+    """Every (method, path, route) of an app, included routers as well; the path as OpenAPI writes it."""
     for route in iter_route_contexts(app.routes):
         for method in sorted(getattr(route, "methods", None) or ()):
-            yield method, str(route.path), route
+            yield method, str(getattr(route, "path_format", route.path)), route
 
 
 def roles_of(route: Any) -> tuple[str, ...] | None:

@@ -21,6 +21,7 @@ KEPT_ANSWERS = 256
 KEPT_FOR_S = 600.0
 _OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 _READS = frozenset({"GET", "HEAD", "OPTIONS"})
+_METHODS = _READS | {"POST", "PUT", "PATCH", "DELETE"}
 BROKEN = GardenError("something broke in here", hint="the log says what")
 _log = structlog.get_logger("garden.http")
 Headers = Iterable[tuple[bytes, bytes]]
@@ -104,7 +105,8 @@ class Guard:
             await self._refuse(scope, receive, counted, BROKEN, begun=status != 0)
         finally:
             route = getattr(scope.get("route"), "path", "unmatched")
-            self._requests.labels(scope["method"] if route != "unmatched" else "any", route, status).inc()
+            known = route != "unmatched" and scope["method"] in _METHODS
+            self._requests.labels(scope["method"] if known else "any", route, status).inc()
             self._seconds.labels(route).observe(loop.time() - began_s)
 
     async def _refuse(self, scope: Scope, receive: Receive, send: Send, error: GardenError, begun: bool) -> None:

@@ -21,8 +21,11 @@ REQUEST_WITHIN_S = 5.0
 CONNECTIONS_MAX = 1000
 HEADER_BYTES_MAX = 16 * 1024
 _WAITING = (h11.IDLE, h11.SEND_BODY)
-_SLOW = b'{"title":"Request Timeout","status":408,"detail":"the request did not come in whole"}'
-_BROKEN = b'{"title":"Bad Request","status":400,"detail":"this is not HTTP/1.1"}'
+_SLOW = (
+    b'{"title":"Request Timeout","status":408,"detail":"the request did not come in whole",'
+    b'"hint":"send head and body at once"}'
+)
+_BROKEN = b'{"title":"Bad Request","status":400,"detail":"this is not HTTP/1.1","hint":"speak HTTP/1.1, without TLS"}'
 
 
 class ImpatientProtocol(H11Protocol):

@@ -12,6 +12,7 @@ from core.errors import BadRequest, Unprocessable
 
 M = TypeVar("M", bound=BaseModel)
 DEPTH_MAX = 32
+_BODILESS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 def body(model: type[M]) -> Any:
@@ -96,6 +97,26 @@ def _inside(item: Any) -> list[Any]:
     if isinstance(item, dict):
         return list(item.values())
     return item if isinstance(item, list) else []
+
+
+async def no_surplus(request: Request) -> None:
+    """Dependency of every route: raises Unprocessable for a query parameter, BadRequest for a body it does not know."""
+    route = request.scope.get("route")
+    dependant = getattr(route, "dependant", None)
+    if dependant is None:
+        return
+    known = query_names(dependant)
+    if strange := next((name for name in request.query_params if name not in known), None):
+        hint = f"known here: {', '.join(sorted(known))}" if known else "this takes no query parameter"
+        raise Unprocessable(f"no query parameter {strange[:40]!r}", hint=hint)
+    if request.method not in _BODILESS and not readers(dependant) and (await request.body()).strip() not in (b"", b"{}"):
+        raise BadRequest("this takes no body", hint="send none, or {}")
+
+
+def query_names(dependant: Any) -> set[str]:
+    """The query parameters of a route and of its dependencies."""
+    names = {field.alias for field in dependant.query_params}
+    return names.union(*(query_names(inner) for inner in dependant.dependencies))
 
 
 def readers(dependant: Any) -> list[Reader]:

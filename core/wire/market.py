@@ -12,7 +12,7 @@ from core.wire.geometry import Point3, Pose2
 TaskKind = Literal["water", "inventory", "harvest", "probe", "scan", "survey", "spray", "charge", "refill"]
 TaskState = Literal["announced", "awarded", "running", "done", "failed", "cancelled"]
 FINAL_STATES = ("done", "failed", "cancelled")
-Epoch = Annotated[int, Field(ge=0)]
+Epoch = Annotated[int, Field(ge=0, le=2**53)]
 
 BID_WINDOW_S = 2.0
 REALLOCATE_S = 10.0
@@ -25,7 +25,7 @@ class PlantCard(Document):
     """What a robot needs to serve a plant."""
 
     plant_id: Identifier
-    url: str
+    url: Annotated[str, Field(max_length=200)]
     stem: Point3
     """Centre of the soil's surface, world frame."""
     dock: Pose2
@@ -42,7 +42,7 @@ class Announcement(Document):
     plant: PlantCard
     dose_ml: Annotated[float, Field(ge=0, le=500)] = 0.0
     priority: Annotated[int, Field(ge=0, le=9)] = 5
-    holder: str = ""
+    holder: Annotated[str, Field(max_length=80)] = ""
     """The robot that has the task now, when the plant asks again."""
 
 
@@ -172,7 +172,7 @@ class ReservationRequest(Document):
     """`POST /dock/reservations` at a plant or station. Asking again renews. `dock_id` names a station's dock."""
 
     robot_id: Identifier
-    dock_id: str = ""
+    dock_id: Annotated[str, Field(max_length=80)] = ""
     for_s: Annotated[float, Field(gt=0, le=600)] = 30.0
     yielding: bool = False
     """The holder only rests here: it leaves when somebody else asks."""

@@ -11,6 +11,9 @@ from core.wire.geometry import Point3, Pose2
 from core.wire.market import PlantCard
 
 Colour = Literal["green", "turning", "red"]
+Pixels = Annotated[float, Field(ge=-1e5, le=1e5)]
+GardenSeconds = Annotated[float, Field(ge=0, le=1e12)]
+"""A time on the garden's clock."""
 
 
 class SoilReading(Document):
@@ -75,10 +78,10 @@ class Fruit(Document):
     radius_m: Annotated[float, Field(gt=0, le=0.2)]
     robot_pose: Pose2 | None = None
     """Base pose relative to the plant when it was seen."""
-    image_x_px: float | None = None
-    image_y_px: float | None = None
-    first_seen_s: float = 0.0
-    last_seen_s: float = 0.0
+    image_x_px: Pixels | None = None
+    image_y_px: Pixels | None = None
+    first_seen_s: GardenSeconds = 0.0
+    last_seen_s: GardenSeconds = 0.0
 
 
 class NewFruit(Document):
@@ -91,8 +94,8 @@ class NewFruit(Document):
     z_m: Annotated[float, Field(ge=-5, le=5)]
     radius_m: Annotated[float, Field(gt=0, le=0.2)]
     robot_pose: Pose2 | None = None
-    image_x_px: float | None = None
-    image_y_px: float | None = None
+    image_x_px: Pixels | None = None
+    image_y_px: Pixels | None = None
 
 
 class Scan(Document):

@@ -67,7 +67,7 @@ class JobRequest(Document):
     x_m: Annotated[float, Field(ge=-100, le=100)] | None = None
     y_m: Annotated[float, Field(ge=-100, le=100)] | None = None
     yaw_rad: Annotated[float, Field(ge=-10, le=10)] | None = None
-    at: str = ""
+    at: Annotated[str, Field(max_length=80)] = ""
     """Whose dock: a plant's id, or `station/DOCK`."""
 
 
