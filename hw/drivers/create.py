@@ -13,7 +13,7 @@ import contextlib
 import math
 
 from core.clock import Clock
-from hw.drivers.session import Pulse, Session
+from hw.drivers.session import LONG_REST_S, Pulse, Session
 from hw.links import Opener
 from hw.ports import BaseReading, ChargingState
 from hw.protocols import create as wire
@@ -24,6 +24,8 @@ SILENCE_S = 0.5
 """While streaming; at rest three polls may be lost."""
 POLL_S = 1.0
 SILENCE_RESTING_S = 3.5
+LULL_S = 9.0
+"""After a long rest it is left alone for so long between polls."""
 SETTLE_S = 0.05
 """Between mode changes at connection; the manual asks for 20 ms."""
 REFRESH_S = 0.25
@@ -79,6 +81,7 @@ class CreateDriver(Session):
         self._reading: BaseReading | None = None
         self._fresh, self._rest_changed = Pulse(), Pulse()
         self._resting = False
+        self._resting_since_s = self._asked_s = 0.0
         self._left_m = self._right_m = 0.0
         self._ticks: tuple[int, int] | None = None
         self._mode: Mode | None = None
@@ -149,7 +152,7 @@ class CreateDriver(Session):
     def rest(self, resting: bool) -> None:
         if resting is self._resting:
             return
-        self._resting = resting
+        self._resting, self._resting_since_s = resting, self._clock.now()
         self.silence_s = SILENCE_RESTING_S if resting else SILENCE_S
         self._heard_s = self._clock.now()
         self._rest_changed.fire()
@@ -209,10 +212,18 @@ class CreateDriver(Session):
             if self._resting:
                 await self._poll()
                 await self._until_rest_changes(POLL_S)
+                if self._settled():
+                    self.silence_s = SILENCE_RESTING_S + LULL_S
+                    await self._until_rest_changes(LULL_S)
             else:
                 self._polling = False
                 self._send(wire.stream(PACKETS[self._model]))
                 await self._until_rest_changes(KEEP_AWAKE_S)
+
+    def _settled(self) -> bool:
+        """Resting for long, and the last poll was answered."""
+        long = self._clock.now() - self._resting_since_s > LONG_REST_S
+        return self._resting and long and self._heard_s >= self._asked_s
 
     async def _until_rest_changes(self, seconds: float) -> None:
         with contextlib.suppress(TimeoutError):
@@ -224,7 +235,7 @@ class CreateDriver(Session):
         if not self._polling:
             self._send(wire.stream_switch(False))
             await self._clock.sleep(SETTLE_S)
-        self._polling = True
+        self._polling, self._asked_s = True, self._clock.now()
         self._answer_bytes.clear()
         self._send(wire.stream_switch(False) + wire.query(PACKETS[self._model]))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 from abc import ABC, abstractmethod
@@ -21,8 +22,8 @@ BACKOFF_S_MIN = 0.1
 BACKOFF_S_MAX = 2.0
 GRACE_S = 0.02
 """After a stall of our own, bytes that wait in the socket are read before the device is called silent."""
-WATCH_S_MAX = 0.5
-"""The silence watch looks at least this often, because the allowed silence may shrink while it sleeps."""
+LONG_REST_S = 120.0
+"""A device that has rested so long is asked only now and then."""
 
 
 class Pulse:
@@ -84,7 +85,7 @@ class Session(ABC):
 
     @silence_s.setter
     def silence_s(self, seconds: float) -> None:
-        if math.isinf(self._silence_s) and not math.isinf(seconds):
+        if seconds < self._silence_s:
             self._hushed.fire()
         self._silence_s = seconds
 
@@ -180,10 +181,9 @@ class Session(ABC):
             left_s = self._heard_s + self.silence_s - self._clock.now()
             if left_s <= 1e-6:
                 raise DriverTimeout(self._url, self.silence_s)
-            if math.isinf(left_s):
-                await self._hushed.wait()
-            else:
-                await self._clock.sleep(min(left_s, WATCH_S_MAX))
+            with contextlib.suppress(TimeoutError):
+                async with self._clock.timeout(None if math.isinf(left_s) else left_s):
+                    await self._hushed.wait()
 
     async def _shut(self, link: ByteLink) -> None:
         try:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 
 from core.clock import Clock
 from core.errors import DriverError
-from hw.drivers.session import Pulse, Session
+from hw.drivers.session import LONG_REST_S, Pulse, Session
 from hw.links import Opener
 from hw.ports import ServoReading
 from hw.protocols import ssc32 as wire
@@ -21,6 +21,8 @@ POLL_S = 0.1
 """While servos move or an output is high."""
 POLL_STILL_S = 0.5
 POLL_RESTING_S = 1.0
+LULL_S = 9.0
+"""After a long rest it is left alone for so long between polls."""
 SETTLE_S = 0.5
 """A move is watched this much longer than it should take."""
 ASK_VERSION_S = 0.4
@@ -54,6 +56,7 @@ class Ssc32Driver(Session):
         self._busy_until_s = -math.inf
         self._period_s = POLL_RESTING_S
         self._resting = False
+        self._resting_since_s = 0.0
         self._reading: ServoReading | None = None
         self._known: set[int] = set()
         self._moved: set[int] = set()
@@ -109,7 +112,7 @@ class Ssc32Driver(Session):
     def rest(self, resting: bool) -> None:
         """Poll at 1 Hz, or at 2 Hz; while something moves always at 10 Hz."""
         if resting != self._resting:
-            self._resting = resting
+            self._resting, self._resting_since_s = resting, self._clock.now()
             self._wake.fire()
 
     def _quiet(self) -> bytes:
@@ -139,7 +142,15 @@ class Ssc32Driver(Session):
             self._period_s = self._poll_s()
             self.silence_s = max(self.silence_s, self._patience_s())
             await (self._clock.sleep(POLL_S) if self._period_s == POLL_S else self._pause(self._period_s, self._wake))
+            if self._lulled():
+                self.silence_s = SILENCE_S_MAX + LULL_S
+                await self._pause(LULL_S, self._wake)
             self._ask(tuple(sorted(self._known)))
+
+    def _lulled(self) -> bool:
+        """Resting for long, and the last poll was answered."""
+        still = self._resting and self._poll_s() != POLL_S
+        return still and self._asked is None and self._clock.now() - self._resting_since_s > LONG_REST_S
 
     def _poll_s(self) -> float:
         if self._high or self._clock.now() < self._busy_until_s:

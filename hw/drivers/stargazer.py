@@ -10,7 +10,7 @@ import math
 
 from core.clock import Clock
 from core.errors import DriverTimeout
-from hw.drivers.session import Pulse, Session
+from hw.drivers.session import LONG_REST_S, Pulse, Session
 from hw.links import Opener
 from hw.ports import MarkerFix
 from hw.protocols import stargazer as wire
@@ -19,6 +19,8 @@ SILENCE_S = 3.0
 SILENCE_RESTING_S = 20.0
 KEEPALIVE_S = 10.0
 """How often a resting device is asked to prove that it is there."""
+LULL_S = 60.0
+"""The same after a long rest."""
 ACK_S = 1.0
 TRIES = 4
 RANGE_CM_MAX = 1000.0
@@ -38,6 +40,7 @@ class StargazerDriver(Session):
         self._fix: MarkerFix | None = None
         self._arrived, self._acked, self._wake = Pulse(), Pulse(), Pulse()
         self._resting = False
+        self._resting_since_s = 0.0
         self._ack = ""
         self.fixes = 0
         """Fixes with a marker since the driver was made."""
@@ -59,7 +62,7 @@ class StargazerDriver(Session):
     def rest(self, resting: bool) -> None:
         """Stop the device's calculation, or start it again (which takes it half a second)."""
         if resting != self._resting:
-            self._resting = resting
+            self._resting, self._resting_since_s = resting, self._clock.now()
             self._wake.fire()
 
     def _gone(self) -> None:
@@ -72,7 +75,13 @@ class StargazerDriver(Session):
             resting = self._resting
             await self._command("CalcStop" if resting else "CalcStart")
             if self._resting == resting:
-                await self._pause(KEEPALIVE_S if resting else None, self._wake)
+                await self._pause(self._keepalive_s() if resting else None, self._wake)
+
+    def _keepalive_s(self) -> float:
+        if self._clock.now() - self._resting_since_s <= LONG_REST_S:
+            return KEEPALIVE_S
+        self.silence_s = SILENCE_RESTING_S + LULL_S
+        return LULL_S
 
     async def _command(self, name: str) -> None:
         """Send until acknowledged; pose frames come in between."""
