@@ -12,8 +12,8 @@ from core.errors import GardenError, LinkDown, Unprocessable
 from core.wire.body import BodyState, Control, Hello, LineBuffer, Setpoint, decode, encode
 from hw.links import ByteLink, Opener
 
-SILENCE_S = 2.5
-"""A resting body speaks at 2 Hz; longer than this without a word and it is down."""
+SILENCE_S = 2.0
+"""A body that says nothing for so long after it should have spoken is down."""
 RETRY_S = (0.2, 0.5, 1.0, 2.0)
 
 _log = structlog.get_logger("robot.bodylink")
@@ -26,7 +26,7 @@ class BodyLink:
         self._url, self._secret, self._opener, self._clock = url, secret, opener, clock
         self._link: ByteLink | None = None
         self._seq = 0
-        self._heard_s = -1e9
+        self._patient_until_s = -1e9
         self._resting: bool | None = None
         self.state: BodyState | None = None
         self.why = "not connected yet"
@@ -38,7 +38,7 @@ class BodyLink:
         """Why the body cannot be used; empty while it can."""
         if self._link is None:
             return f"body: {self.why}"
-        if self.state is None or self._clock.now() - self._heard_s > SILENCE_S:
+        if self.state is None or self._clock.now() > self._patient_until_s:
             return "body: connected, but silent"
         return ""
 
@@ -80,7 +80,8 @@ class BodyLink:
                 self._take(message)
 
     def _take(self, state: BodyState) -> None:
-        self.state, self._heard_s = state, self._clock.now()
+        self.state = state
+        self._patient_until_s = self._clock.now() + state.next_in_s + SILENCE_S
         for listener in self.listeners:
             listener(state)
 
@@ -124,6 +125,7 @@ class BodyLink:
         """Ask for slow readings, or the full rate, once each way."""
         if resting != self._resting and self._link is not None:
             self._resting = resting
+            self._patient_until_s = min(self._patient_until_s, self._clock.now() + SILENCE_S)
             self._send(encode(Control(order="rest" if resting else "wake")))
 
     def _send(self, data: bytes) -> None:

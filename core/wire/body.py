@@ -114,6 +114,8 @@ class BodyState:
     """Why the gate refused the newest setpoint, or parts of it; empty when all was allowed."""
     down: tuple[str, ...] = ()
     """Devices whose link is down, each with its reason."""
+    next_in_s: float = 0.5
+    """The next state comes within so many seconds, if nothing happens before."""
 
 
 Message = Hello | Setpoint | Control | BodyState

@@ -33,6 +33,8 @@ from robot_service.body.stream import BrainPort, MemoryListen
 DT_S = 0.02
 RESTING_DT_S = 0.5
 REST_AFTER_S = 2.0
+LONG_REST_S, LONG_REST_DT_S = 120.0, 10.0
+"""After so long a rest turns come so seldom; whatever is wanted wakes the body at once."""
 WAKING_S = 1.0
 """After a rest the readings need a moment; a refusal for want of them is not worth telling so soon."""
 _log = structlog.get_logger("robot.body")
@@ -65,6 +67,7 @@ class BodyNode:
         self._orders: asyncio.Queue[Control] = asyncio.Queue(16)
         self._resting = False
         self._kept_awake = False
+        self._long_rest = False
         self._active_s = self._woke_s = self._ticked_s = clock.now()
         self._brains = 0
         self._verdict = Verdict()
@@ -109,6 +112,8 @@ class BodyNode:
     def tick(self) -> None:
         """One turn of the control loop."""
         now_s = self._clock.now()
+        self._long_rest = self._resting and now_s - self._active_s > LONG_REST_S
+        self.senses.lull_s = LONG_REST_DT_S if self._long_rest or now_s - self._woke_s < WAKING_S else 0.0
         self.senses.look()
         if self.brain.brains != self._brains:
             self._brains = self.brain.brains
@@ -154,9 +159,13 @@ class BodyNode:
             stopped=self.latch.stopped,
             stopped_by=self.latch.by,
             refusal="" if waking else self._verdict.refusal,
+            next_in_s=self._next_in_s(),
         )
 
     # Resting
+
+    def _next_in_s(self) -> float:
+        return LONG_REST_DT_S if self._long_rest else RESTING_DT_S
 
     def _rest_or_wake(self, setpoint: Setpoint | None, now_s: float) -> None:
         if self._kept_awake or self._busy(now_s) or (setpoint is not None and self._wanting(setpoint, now_s)):
@@ -179,6 +188,7 @@ class BodyNode:
         self._resting = resting
         if not resting:
             self._woke_s = now_s
+            self._long_rest = False
         for driver in (self._drivers.base, self._drivers.servos, self._drivers.localizer):
             driver.rest(resting)
 
@@ -198,7 +208,7 @@ class BodyNode:
             return
         self._woken.clear()
         try:
-            async with self._clock.timeout(RESTING_DT_S):
+            async with self._clock.timeout(self._next_in_s()):
                 await self._woken.wait()
         except TimeoutError:
             return

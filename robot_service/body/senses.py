@@ -60,6 +60,8 @@ class Senses:
         self._arm_of: ServoReading | None = None
         self._arm: Joints | None = None
         self._stamp_s = 0.0
+        self.lull_s = 0.0
+        """How much older readings may be, while the devices are asked seldom."""
         self.base, self.servos = _NO_BASE, _NO_SERVOS
 
     def look(self) -> None:
@@ -88,7 +90,7 @@ class Senses:
 
     def _analog_v(self, index: int, now_s: float) -> float | None:
         """A silent sensor reads nothing, not its last word."""
-        fresh = self._servos.link.up and now_s - self.servos.stamp_s <= ANALOG_FRESH_S
+        fresh = self._servos.link.up and now_s - self.servos.stamp_s <= ANALOG_FRESH_S + self.lull_s
         return self.servos.analog_v[index] if fresh and index < len(self.servos.analog_v) else None
 
     def down(self) -> tuple[str, ...]:
@@ -141,6 +143,7 @@ class Senses:
         stopped: bool,
         stopped_by: str,
         refusal: str,
+        next_in_s: float,
     ) -> BodyState:
         b, arm = self.base, self.arm_rad
         last = self._sight.last
@@ -178,6 +181,7 @@ class Senses:
             stopped_by=stopped_by,
             refusal=refusal,
             down=self.down(),
+            next_in_s=next_in_s,
         )
 
 
