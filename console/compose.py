@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from console.processes import Place, Process, enrolled, processes
@@ -13,6 +13,8 @@ from core.scenario import Scenario
 IMAGE = "robot-garden"
 USER = 10001
 _CHECK = ["CMD", "python", "-m", "console.health"]
+_MOUNTED = "/scenario.toml"
+"""Where a scenario that is not in the image is seen."""
 _SOCKETS = PurePosixPath("/run/robot")
 
 
@@ -29,7 +31,13 @@ def place(scenario: str) -> Place:
 
 
 def compose(scenario: str, as_json: bool) -> None:
-    document = describe(scenarios.find(scenario), scenario)
+    built_in = (scenarios.SCENARIOS_DIR / scenario).is_dir()
+    document = describe(scenarios.find(scenario), scenario if built_in else _MOUNTED)
+    if not built_in:
+        path = Path(scenario).resolve()
+        path = path / "scenario.toml" if path.is_dir() else path
+        for name in ("init", "sim"):
+            document["services"][name]["volumes"].append(f"{path}:{_MOUNTED}:ro")
     print(json.dumps(document, indent=1) if as_json else render(document), end="\n" if as_json else "")
 
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from console import toml
-from console.compose import describe, place, render
+from console.compose import compose, describe, place, render
 from console.folder import Folder
 from console.processes import World, enrolled, ports_of, processes
 from core import scenario as scenarios
@@ -102,3 +102,12 @@ def test_the_compose_file_in_the_repository_is_the_generated_one() -> None:
 
 def test_the_yaml_means_what_was_described() -> None:
     assert compose_of(GARDEN) == json.loads(json.dumps(describe(GARDEN, "garden")))
+
+
+def test_a_scenario_of_ones_own_is_mounted_where_it_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.toml").write_text(toml.dump(GARDEN))
+    compose(str(tmp_path / "mine.toml"), as_json=True)
+    services = json.loads(capsys.readouterr().out)["services"]
+    for name in ("init", "sim"):
+        assert f"{tmp_path}/mine.toml:/scenario.toml:ro" in services[name]["volumes"]
+    assert services["sim"]["environment"]["SIM_SCENARIO"] == "/scenario.toml"
