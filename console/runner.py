@@ -63,7 +63,7 @@ class Runner:
 
     async def _keep(self, child: Child) -> None:
         """Start, wait for the end, wait a little longer each time, start again."""
-        delay_s = BACKOFF_S[0]
+        delay_s = BACKOFF_S[0] / 2
         while True:
             code = await self._live(child)
             child.deaths += 1

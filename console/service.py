@@ -85,7 +85,7 @@ def _add_reads(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
         return await glance.now()
 
     @app.get("/overview.jpg", tags=["garden"], summary="The simulated world from above", response_class=Response)
-    async def overview(t: Annotated[int, Query(description="any number: makes the address a new one")] = 0) -> Response:
+    async def overview(t: Annotated[int, Query(ge=0, le=2**53, description="makes the address a new one")] = 0) -> Response:
         worlds = peers.of_kind("sim")
         if not worlds:
             raise NotFound("a real garden has no simulated world", hint="look out of the window")

@@ -8,13 +8,13 @@ import fcntl
 import json
 import os
 import signal
+import sys
 from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
 from pydantic import ValidationError
-from rich.console import Console
 
 from console import toml
 from console.folder import Folder
@@ -50,17 +50,20 @@ class Wish:
 
 
 class Voice:
-    """Tells a person, or with `--json` a program: one JSON object a line."""
+    """Tells a person, or with `--json` a program: one JSON object a line. Goes on when nobody listens any more."""
 
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
-        self._console = Console(highlight=False)
+        self._heard = True
 
     def say(self, text: str, **document: object) -> None:
-        if self._as_json:
-            print(json.dumps(document or {"note": text}), flush=True)
-        else:
-            self._console.print(text, soft_wrap=True)
+        if not self._heard:
+            return
+        try:
+            print(json.dumps(document or {"note": text}) if self._as_json else text, flush=True)
+        except BrokenPipeError:
+            self._heard = False
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def up(wish: Wish) -> None:
@@ -121,7 +124,7 @@ async def _up(wish: Wish, scenario: Scenario, listed: Sequence[Process]) -> None
     runner = Runner(listed, wish.folder.logs, lambda name, what: voice.say(f"{name} {what}", process=name, what=what))
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, ended.set)
     async with asyncio.TaskGroup() as group:
         work = [group.create_task(runner.run()), group.create_task(_greet(wish, scenario, runner, voice))]
@@ -178,7 +181,7 @@ def _say_ready(wish: Wish, scenario: Scenario, peers: dict[str, Peer], voice: Vo
     plant, robot = scenario.plants[0].id, scenario.robots[0].id
     data = "" if wish.folder.root == Path("data") else f" --data {wish.folder.root}"
     lines = [
-        f"[bold]Garden ready[/bold] after {seconds:.1f} s. Ctrl-C ends it.",
+        f"Garden ready after {seconds:.1f} s. Ctrl-C ends it.",
         f"  the garden in a browser:  {peers['console'].url}",
         f"  the world from above:     {peers['sim'].url}/overview.jpg",
         f"  curl -s {peers[plant].url}/state",
