@@ -43,6 +43,8 @@ class Scheduler:
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
     _own_after_s: float = 0.0
     _own_number: int = 0
+    _sent: bool = False
+    """An operator sent it where it stands: it stays until it is needed elsewhere, or in somebody's way."""
 
     # ------------------------------------------------------------------ what others do to the queue
     def changed(self) -> None:
@@ -126,6 +128,7 @@ class Scheduler:
         if entry.announcement is None and report.state == "failed":
             self._own_after_s = self.robot.clock.now() + OWN_RETRY_S
         self.reporter.jobs_ended(entry, report)
+        self._sent = entry.job is not None and entry.job.kind in ("goto", "undock") and report.state == "done"
         if cut and self.robot.where.docked_at and not self._stopped():
             await self._worked(self._leave())
 
@@ -215,7 +218,9 @@ class Scheduler:
             await self.robot.clock.sleep(IDLE_LOOK_S)
             return
         me = (RANK_IDLE, self.robot.settings.id)
-        if distance_m(pose, home) > HOME_M or in_the_way_of(me, pose, self.robot.neighbours.others()):
+        away = distance_m(pose, home) > HOME_M and not self._sent
+        if away or in_the_way_of(me, pose, self.robot.neighbours.others()):
+            self._sent = False
             await self._go_home()
             return
         self.robot.body.rest(True)
