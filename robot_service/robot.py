@@ -99,6 +99,8 @@ class Robot:
             raise SkillFailed(self.body.down or "the body is silent")
         if state.stopped:
             raise Halted(f"stopped by {state.stopped_by or 'the e-stop'}")
+        if state.battery_ratio <= 0.0 and not state.docked:
+            raise SkillFailed("the battery is empty: carry the robot to a dock")
         if state.wheel_drop:
             raise SkillFailed("a wheel hangs in the air: put the robot down")
         return state

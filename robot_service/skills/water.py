@@ -19,6 +19,8 @@ ENOUGH_ML, SHORT_S = 2.0, 0.5
 """A dose this near to its end that does not grow any more is done."""
 DRY_ML = 4.0
 """The tank's sensor reads this little when nothing comes any more."""
+LEVEL_ERROR_ML = 20.0
+"""Two readings of the tank's level differ by this much at most without any water having gone."""
 
 TakePermit = Callable[[], Awaitable[tuple[Permit, float]]]
 """Asks the plant; returns the permit and when it was asked for [garden s]."""
@@ -45,10 +47,22 @@ def nozzle_in_base(pose: tuple[float, float, float], plant: PlantCard) -> tuple[
 async def water(robot: Robot, plant: PlantCard, take_permit: TakePermit, poured: Poured) -> None:
     """Deliver one dose. `poured` tells what came out whatever happens; raises SkillFailed when nothing could be begun."""
     await reach(robot, nozzle_in_base(robot.pose(), plant))
+    full_ml = robot.state().tank_ml
     permit, asked_s = await take_permit()
     await _pour(robot, permit, asked_s, poured)
     await _drip(robot, DRIP_S)
+    _believe(poured, full_ml, robot.state().tank_ml)
     await fold_arm(robot)
+
+
+def _believe(poured: Poured, before_ml: float | None, after_ml: float | None) -> None:
+    """The pump's running time says what came out; the tank's level must agree that it came."""
+    if before_ml is None or after_ml is None or poured.delivered_ml <= 2 * LEVEL_ERROR_ML:
+        return
+    gone_ml = max(0.0, before_ml - after_ml)
+    if gone_ml < poured.delivered_ml / 2:
+        said_ml, poured.delivered_ml = poured.delivered_ml, gone_ml
+        poured.why = f"the pump ran for {said_ml:.0f} ml, but the tank's level fell by {gone_ml:.0f} ml"
 
 
 async def _pour(robot: Robot, permit: Permit, asked_s: float, poured: Poured) -> None:

@@ -43,6 +43,8 @@ BOOT_TEXT = b"bl-start\r\nemulated create2\r\nbooting: garden\r\n"
 ROBOT_RADIUS_MM = 170
 COMMANDS_PER_STEP_MAX = 200
 """A script that loops without waiting must not hang the firmware."""
+STREAM_BYTES_MAX = 255
+"""A frame tells its length in one byte; a stream of more packets than that is not sent."""
 _EPS_S = 1e-9
 
 
@@ -213,7 +215,8 @@ class CreateEmulator:
     def _send_frame(self, now_s: float) -> None:
         if self._stream_layout is not None and self._stream_on and self.mode is not Mode.OFF:
             payload = self._stream_layout.pack(self._values(self._stream_layout.packets, now_s))
-            self._out += frame(payload, CHECKSUM[self.model])
+            if len(payload) <= STREAM_BYTES_MAX:
+                self._out += frame(payload, CHECKSUM[self.model])
 
     def _values(self, packets: tuple[int, ...], now_s: float) -> dict[int, int]:
         return self.senses.values(packets, self._body.sense(), self, now_s)

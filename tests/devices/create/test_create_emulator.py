@@ -520,3 +520,11 @@ def test_a_closed_link_stops_nothing() -> None:
         running.cancel()
 
     run_virtual(main())
+
+
+def test_a_stream_longer_than_a_frame_can_tell_is_not_sent() -> None:
+    robot = Robot(mode=Mode.SAFE)
+    robot.say(oi.stream([100] * 4))
+    assert robot.wait(0.1) == b""
+    robot.say(oi.stream([7]))
+    assert robot.wait(0.1) != b""
