@@ -59,7 +59,7 @@ class Brain:
         markers = ceiling_markers(settings.map.arena)
         where = Localisation(settings.localisation, settings.wheelbase_m, markers, settings.map, clock)
         self.events = EventLog(clock)
-        neighbours = Neighbours(settings.id, peers, mesh, clock, lambda: self.robot.moving, lambda: where.pose)
+        neighbours = Neighbours(settings.id, peers, mesh, clock, lambda: self.robot.moving, lambda: where.pose, self._idle)
         self.robot = Robot(
             settings, clock, rng, self.body, where, Ground(settings.map), neighbours, mesh, peers, self.events
         )
@@ -75,6 +75,9 @@ class Brain:
         self.body.listeners += [where.take, self.robot.watch, self._see]
 
     # ------------------------------------------------------------------ readings
+    def _idle(self) -> bool:
+        return self.robot.activity.job == "idle" and not self.queue.entries
+
     def _see(self, state: BodyState) -> None:
         if state.stopped != self._stopped:
             self._stopped = state.stopped
@@ -123,6 +126,7 @@ class Brain:
 
     def position(self) -> Position:
         """Raises Unavailable until the robot knows where it is."""
+        self.robot.neighbours.asked()
         pose, activity = self.robot.where.pose, self.robot.activity
         if pose is None:
             raise Unavailable(self.robot.where.lost or "does not know where it is", hint="ask again in a second")

@@ -18,6 +18,9 @@ MOVING_EVERY_S = 1.0
 NEAR_EVERY_S = 0.5
 NEAR_M = 1.6
 STILL_EVERY_S = 5.0
+IDLE_EVERY_S = 30.0
+ASKED_EVERY_S = 5.0
+"""Somebody who asks for our position is about to move: ask back, but not more often than this."""
 
 
 @dataclass(slots=True)
@@ -36,9 +39,12 @@ class Neighbours:
     clock: Clock
     moving: Callable[[], bool]
     pose: Callable[[], Pose | None]
+    idle: Callable[[], bool] = lambda: False
+    """Nothing to do, so that we shall not move before somebody asks us to."""
     heard: dict[str, Heard] = field(default_factory=dict)
     _asked_s: float = -1e9
     _wake: asyncio.Event = field(default_factory=asyncio.Event)
+    _stirred: asyncio.Event = field(default_factory=asyncio.Event)
 
     async def run(self) -> None:
         while True:
@@ -58,12 +64,28 @@ class Neighbours:
     def _hear(self, peer: Peer, answer: Position | GardenError, asked_s: float) -> None:
         if isinstance(answer, Position) and answer.robot_id == peer.id:
             self.heard[peer.id] = Heard(answer, asked_s)
+            if answer.moving:
+                self._stirred.set()
 
     async def fresh(self, within_s: float = 0.5) -> None:
         """Before the first move: hear the neighbours unless that was just done."""
         if self.clock.now() - self._asked_s > within_s:
             await self.poll()
+        self._wake.set()
+
+    def asked(self) -> None:
+        """Somebody asked where we are."""
+        if self.clock.now() - self._asked_s > ASKED_EVERY_S:
             self._wake.set()
+
+    async def stir(self, within_s: float) -> None:
+        """Returns when news of a moving neighbour comes, or after `within_s`."""
+        self._stirred.clear()
+        try:
+            async with self.clock.timeout(within_s):
+                await self._stirred.wait()
+        except TimeoutError:
+            pass
 
     async def _pause(self) -> None:
         self._wake.clear()
@@ -76,7 +98,7 @@ class Neighbours:
     def _every_s(self) -> float:
         mine = self.moving()
         if not mine and not any(heard.position.moving for heard in self.heard.values()):
-            return STILL_EVERY_S
+            return IDLE_EVERY_S if self.idle() else STILL_EVERY_S
         pose = self.pose()
         near = pose is not None and any(
             distance_m(pose, (h.position.pose.x_m, h.position.pose.y_m)) < NEAR_M for h in self.heard.values()

@@ -14,6 +14,8 @@ from core.wire.robot import Job
 from robot_service.robot import Robot
 
 LOOK_S = 0.5
+NOTHING_S = 60.0
+"""While there is nothing to tell; an award or an end is told of at once."""
 FINAL_RETRY_S = 2.0
 FINAL_LIFE_S = 600.0
 JOBS_KEPT = 100
@@ -49,7 +51,7 @@ class Reporter:
             await asyncio.gather(*(self._tell(entry) for entry in self._due()), self._tell_ends())
             self._told = {task_id: told for task_id, told in self._told.items() if self.queue.find(task_id)}
             try:
-                async with self.robot.clock.timeout(LOOK_S if self.queue.entries or self._finals else 5.0):
+                async with self.robot.clock.timeout(LOOK_S if self.queue.entries or self._finals else NOTHING_S):
                     await self._soon.wait()
             except TimeoutError:
                 pass

@@ -24,6 +24,8 @@ from robot_service.skills.dock import insist
 from robot_service.skills.drive import drive_to, undock
 
 IDLE_LOOK_S = 2.0
+HOME_LOOK_S = 10.0
+"""At home, where only a neighbour on the move changes anything."""
 HOME_M = 0.25
 AFTER_FAILURE_S = 5.0
 OWN_RETRY_S = 60.0
@@ -225,6 +227,7 @@ class Scheduler:
             return
         self.robot.body.rest(True)
         await self.robot.clock.sleep(IDLE_LOOK_S)
+        await self.robot.neighbours.stir(HOME_LOOK_S - IDLE_LOOK_S)
 
     async def _go_home(self) -> None:
         self.robot.activity.job = "home"
