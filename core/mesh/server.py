@@ -48,6 +48,13 @@ class ImpatientProtocol(H11Protocol):
         self._forget()
         super().connection_lost(exc)
 
+    def shutdown(self) -> None:
+        """A request still being answered may finish; a stream never would, and is closed."""
+        super().shutdown()
+        cycle = self.cycle
+        if cycle is not None and cycle.response_started and not cycle.response_complete:
+            self.transport.close()
+
     def send_400_response(self, msg: str) -> None:
         self._say_and_close(b"400 Bad Request", _BROKEN)
 

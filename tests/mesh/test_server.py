@@ -160,3 +160,23 @@ def test_a_taken_port_is_named() -> None:
         port = sock.getsockname()[1]
         with pytest.raises(ConfigError, match=str(port)):
             listen("127.0.0.1", port)
+
+
+def test_an_open_stream_does_not_keep_a_node_from_ending() -> None:
+    ended_s = []
+
+    async def story(port: int) -> None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"GET /events HTTP/1.1\r\nhost: a\r\n\r\n")
+        await reader.readuntil(b"listening")
+        ended_s.append(asyncio.get_running_loop().time())
+        streams.append(writer)
+
+    async def go() -> None:
+        await with_server(story)
+        ended_s.append(asyncio.get_running_loop().time())
+        streams[0].close()
+
+    streams: list[asyncio.StreamWriter] = []
+    asyncio.run(go())
+    assert ended_s[1] - ended_s[0] < 0.9
