@@ -101,6 +101,7 @@ class Driver:
     async def ready(self) -> None:
         async with self._clock.timeout(30.0):
             while self._last is None or self._last.down:
+                self._garden.check()
                 await self._clock.sleep(0.1)
         await self.settle(SETTLE_S)
 

@@ -16,12 +16,12 @@ import mujoco
 from core.robots import gardener as g
 from core.scenario import Robot
 
-TYRE_STIFFNESS_N = 90.0
+TYRE_STIFFNESS_N = 150.0
 """Force per unit of slip ratio, one tyre. Chosen so that an 85 cm square by odometry ends 5-15 % of its length off."""
 REAR_STIFFNESS_N = 14.0
 """Side force of the rear caster per radian of slip angle: it trails and swings round, late."""
 ROLLING_MPS_MIN = 0.02
-DAMPING_MAX = 220.0
+DAMPING_MAX = 350.0
 """Stiffest contact that a 4 ms step integrates calmly [1/s]."""
 ACCELERATION_MPS2 = 1.2
 """The base ramps its wheels; it does not jerk."""

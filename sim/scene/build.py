@@ -22,8 +22,9 @@ FRONT_CASTER_FRICTION = 0.10
 REAR_CASTER_FRICTION = 0.55
 """Sideways, on astroturf; along its own direction the rear caster rolls."""
 TYRE_SOLREF = (0.01, 1.0)
-TYRE_SOLIMP = (0.75, 0.75, 0.001, 0.5, 2.0)
-"""A soft tyre: this impedance also leaves room for creep (`sim.physics.wheels`)."""
+TYRE_SOLIMP = (0.4, 0.4, 0.001, 0.5, 2.0)
+"""A soft tyre. So low an impedance lets the friction rows creep by their regularisation and not by a slow damping, which
+would give slip a memory of half a second (`sim.physics.wheels`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
