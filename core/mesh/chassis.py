@@ -21,12 +21,12 @@ from core.mesh.describe import describe, docs_page
 from core.mesh.events import EventLog
 from core.mesh.guard import Guard, bearer
 from core.mesh.problems import problem_response
-from core.mesh.strict import body, no_surplus, parse
+from core.mesh.strict import body, no_surplus, parse, plain_read
 from core.wire.documents import Document, HistoryEntry, NodeCard
 
 SSE_SILENCE_S = 15.0
 
-__all__ = ["Allow", "allow", "body", "create_app", "parse", "version"]
+__all__ = ["Allow", "allow", "body", "create_app", "parse", "serve_ready", "version"]
 
 
 class Health(Document):
@@ -51,13 +51,17 @@ class Allow:
     async def __call__(self, request: Request) -> Caller:
         state = request.app.state
         verifier: Verifier | None = state.verifier
-        if verifier is None:
-            return ANYBODY
-        caller = verifier.verify(bearer(request.scope["headers"]), state.clock.now())
+        caller = ANYBODY
+        if verifier is not None:
+            caller = verifier.verify(bearer(request.scope["headers"]), state.clock.now())
+            self._check(caller)
+        await no_surplus(request)
+        return caller
+
+    def _check(self, caller: Caller) -> None:
         if caller.role not in self.roles:
             roles = ", ".join(self.roles)
             raise Forbidden(f"{caller.subject} is a {caller.role}", hint=f"this takes the token of a: {roles}")
-        return caller
 
 
 def allow(*roles: str) -> Any:
@@ -92,9 +96,10 @@ def create_app(
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
-        dependencies=[Depends(no_surplus)],
+        dependencies=[Depends(plain_read)],
     )
     registry = registry if registry is not None else CollectorRegistry()
+    app.state.open_reads, app.state.ready_bytes = open_reads, {}
     app.state.clock, app.state.verifier, app.state.events, app.state.registry = clock, verifier, events, registry
     app.add_middleware(
         Guard,
@@ -110,6 +115,16 @@ def create_app(
         _event_route(app, events)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
     return app
+
+
+def serve_ready(app: FastAPI, path: str, make: Callable[[], Response]) -> None:
+    """Let the server answer plain GETs of `path` with what `make` returns, without the app in between.
+
+    `path` must be a route as well: it answers whoever sends conditions, queries or anything unusual, and every test.
+    `make` must be cheap. Does nothing where reads need a token.
+    """
+    if app.state.open_reads:
+        app.state.ready_bytes[path.encode()] = make
 
 
 def _refusals(app: FastAPI) -> None:

@@ -12,7 +12,7 @@ from core.errors import BadRequest, Unprocessable
 
 M = TypeVar("M", bound=BaseModel)
 DEPTH_MAX = 32
-_BODILESS = frozenset({"GET", "HEAD", "OPTIONS"})
+_READS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 def body(model: type[M]) -> Any:
@@ -99,8 +99,14 @@ def _inside(item: Any) -> list[Any]:
     return item if isinstance(item, list) else []
 
 
+async def plain_read(request: Request) -> None:
+    """Dependency of every route: refuses what a read does not know. A change is looked at once its caller is known."""
+    if request.method in _READS:
+        await no_surplus(request)
+
+
 async def no_surplus(request: Request) -> None:
-    """Dependency of every route: raises Unprocessable for a query parameter, BadRequest for a body it does not know."""
+    """Raises Unprocessable for a query parameter, BadRequest for a body that the route does not know."""
     route = request.scope.get("route")
     dependant = getattr(route, "dependant", None)
     if dependant is None:
@@ -109,7 +115,7 @@ async def no_surplus(request: Request) -> None:
     if strange := next((name for name in request.query_params if name not in known), None):
         hint = f"known here: {', '.join(sorted(known))}" if known else "this takes no query parameter"
         raise Unprocessable(f"no query parameter {strange[:40]!r}", hint=hint)
-    if request.method not in _BODILESS and not readers(dependant) and (await request.body()).strip() not in (b"", b"{}"):
+    if request.method not in _READS and not readers(dependant) and (await request.body()).strip() not in (b"", b"{}"):
         raise BadRequest("this takes no body", hint="send none, or {}")
 
 
