@@ -37,7 +37,7 @@ bench: $(STAMP)
 	$(BIN)/garden bench $(ARGS)
 
 reproduce: $(STAMP)
-	$(BIN)/python -m lab.reproduce $(ARGS)
+	$(BIN)/python -m lab.report $(ARGS)
 
 soak: $(STAMP)
 	$(BIN)/python -m pytest -m soak $(ARGS)

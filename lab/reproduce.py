@@ -51,13 +51,14 @@ def show(result: Result, console: Console) -> None:
         bar = bars.get(metric)
         verdict = "" if bar is None else ("ok" if bar.ok else "MISSED")
         wanted = "" if bar is None else f"{bar.op} {bar.bar:g}"
-        table.add_row(metric, _cell(result.paper.get(metric)), _cell(result.ours[metric]), wanted, verdict)
+        table.add_row(metric, cell(result.paper.get(metric)), cell(result.ours[metric]), wanted, verdict)
     console.print(table)
     for note in result.notes:
         console.print(note)
 
 
-def _cell(value: object) -> str:
+def cell(value: object) -> str:
+    """A value for people."""
     if value is None:
         return ""
     return f"{value:.4g}" if isinstance(value, float) else str(value)

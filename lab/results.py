@@ -38,7 +38,11 @@ class Result:
     paper: dict[str, Any]
     ours: dict[str, Any]
     bars: tuple[Bar, ...]
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+    series: dict[str, list[float]] = field(default_factory=dict)
+    """Curves for the report, by name."""
+    axes: tuple[str, str] = ("", "")
+    """What the curves' x and y are."""
 
     @property
     def ok(self) -> bool:
@@ -53,6 +57,7 @@ class Result:
             "ours": self.ours,
             "bars": [bar.document() for bar in self.bars],
             "notes": list(self.notes),
+            "series": self.series,
         }
 
 

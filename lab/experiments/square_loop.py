@@ -199,5 +199,16 @@ def _judge(seed: int, trials: int, blind: list[Drive], seeing: list[Drive]) -> R
         ("marker_error_m", "<=", 0.02),
         ("improvement", ">=", 10.0),
     )
+    named = {"odometry": blind, "markers": seeing}
     paper = {"odometry_drift_ratio": 0.10, "marker_error_m": "no accumulated error over 20 loops"}
-    return Result(name="square-loop", seed=seed, trials=trials, paper=paper, ours=ours, bars=held(ours, *promises))
+    series = {f"{name}, seed {seed}": [math.hypot(*e) for e in drives[0].errors_m] for name, drives in named.items()}
+    return Result(
+        name="square-loop",
+        seed=seed,
+        trials=trials,
+        paper=paper,
+        ours=ours,
+        bars=held(ours, *promises),
+        series=series,
+        axes=("loop", "distance from the start [m]"),
+    )

@@ -170,7 +170,15 @@ def _judge(seed: int, done: list[Trial]) -> Result:
     paper |= {"drive_far_s": 94.25, "drive_far_sd_s": 8.9, "water_s": 20.0}
     notes = tuple(f"failed: {t}" for t in done if not t.success)
     return Result(
-        name="watering", seed=seed, trials=len(done), paper=paper, ours=ours, bars=held(ours, *promises), notes=notes
+        name="watering",
+        seed=seed,
+        trials=len(done),
+        paper=paper,
+        ours=ours,
+        bars=held(ours, *promises),
+        notes=notes,
+        series={"near dock": near, "far dock": far},
+        axes=("trial", "award to charge current [s]"),
     )
 
 

@@ -1,10 +1,12 @@
 """A bar holds only what was measured."""
 
 import math
+from xml.etree import ElementTree
 
 import pytest
 
-from lab.results import Bar, held
+from lab.report import write
+from lab.results import Bar, Result, held
 
 
 @pytest.mark.parametrize(
@@ -24,3 +26,21 @@ def test_what_was_not_measured_is_never_ok(op):
 
 def test_a_missing_metric_fails_its_bar():
     assert [bar.ok for bar in held({"a": 1}, ("a", ">=", 1.0), ("b", ">=", 0.0))] == [True, False]
+
+
+def test_a_report_shows_ours_beside_the_papers_and_what_was_missed(tmp_path):
+    ours = {"error_m": 0.03}
+    result = Result(
+        name="square-loop",
+        seed=1,
+        trials=2,
+        paper={"error_m": 0.1},
+        ours=ours,
+        bars=held(ours, ("error_m", "<=", 0.02)),
+        series={"markers": [0.01, 0.03]},
+        axes=("loop", "m"),
+    )
+    text = write([result], tmp_path).read_text()
+    assert "| `error_m` | 0.1 | 0.03 | <= 0.02 | MISSED |" in text
+    chart = ElementTree.fromstring((tmp_path / "reproduction-square-loop.svg").read_text())
+    assert chart.tag.endswith("svg")
