@@ -12,7 +12,7 @@ from starlette.types import Receive, Scope, Send
 from core.errors import Forbidden
 from core.history import as_csv
 from core.mesh.auth import Caller
-from core.mesh.chassis import allow, body
+from core.mesh.chassis import allow, body, serve_ready
 from core.wire.documents import HistoryEntry
 from core.wire.market import (
     Permit,
@@ -127,6 +127,7 @@ def _inventory_routes(app: FastAPI, pot: Pot) -> None:
         return Response(status_code=204, headers={"etag": now})
 
     _shortcut(app, pot.shelf)
+    serve_ready(app, "/inventory", lambda: pot.shelf.answer(None, ""))
 
 
 def _shortcut(app: FastAPI, shelf: Shelf) -> None:
@@ -207,7 +208,13 @@ def _reservation_routes(app: FastAPI, owner: Pot | Station) -> None:
 
 
 def _history_route(app: FastAPI, journal: Journal) -> None:
-    @app.get("/history", tags=["node"], summary="What happened, and why", response_model=list[HistoryEntry])
+    @app.get(
+        "/history",
+        tags=["node"],
+        summary="What happened, and why",
+        response_model=list[HistoryEntry],
+        responses={200: {"content": {"text/csv": {}}}},
+    )
     async def history(
         since: Annotated[int, Query(ge=0, le=2**53, description="entries after this id")] = 0,
         since_s: Annotated[float | None, Query(ge=0, le=1e12, allow_inf_nan=False)] = None,

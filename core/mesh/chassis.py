@@ -19,7 +19,7 @@ from core.errors import Forbidden, GardenError, Unavailable
 from core.mesh.auth import ANYBODY, ROLES, Caller, Verifier
 from core.mesh.describe import describe, docs_page
 from core.mesh.events import EventLog
-from core.mesh.guard import Guard, bearer
+from core.mesh.guard import Guard, bearer, request_counter
 from core.mesh.problems import problem_response
 from core.mesh.strict import body, no_surplus, parse, plain_read
 from core.wire.documents import Document, HistoryEntry, NodeCard
@@ -99,12 +99,13 @@ def create_app(
         dependencies=[Depends(plain_read)],
     )
     registry = registry if registry is not None else CollectorRegistry()
-    app.state.open_reads, app.state.ready_bytes = open_reads, {}
+    app.state.open_reads, app.state.ready_bytes, app.state.requests = open_reads, {}, request_counter(registry)
     app.state.clock, app.state.verifier, app.state.events, app.state.registry = clock, verifier, events, registry
     app.add_middleware(
         Guard,
         clock=clock,
         verifier=verifier,
+        requests=app.state.requests,
         registry=registry,
         body_bytes_max=body_bytes_max,
         open_reads=open_reads,
@@ -123,8 +124,14 @@ def serve_ready(app: FastAPI, path: str, make: Callable[[], Response]) -> None:
     `path` must be a route as well: it answers whoever sends conditions, queries or anything unusual, and every test.
     `make` must be cheap. Does nothing where reads need a token.
     """
+    counter = app.state.requests.labels("GET", path, 200)
+
+    def counted() -> Response:
+        counter.inc()
+        return make()
+
     if app.state.open_reads:
-        app.state.ready_bytes[path.encode()] = make
+        app.state.ready_bytes[path.encode()] = counted
 
 
 def _refusals(app: FastAPI) -> None:

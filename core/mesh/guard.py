@@ -49,6 +49,11 @@ class _Kept:
     messages: tuple[Message, ...]
 
 
+def request_counter(registry: CollectorRegistry) -> Counter:
+    """Requests answered, by method, route and status."""
+    return Counter("garden_http_requests_total", "Requests answered", ["method", "route", "status"], registry=registry)
+
+
 class Guard:
     """Pure ASGI, so that the answer to anything at all is counted and none is a traceback."""
 
@@ -58,6 +63,7 @@ class Guard:
         *,
         clock: Clock,
         verifier: Verifier | None,
+        requests: Counter,
         registry: CollectorRegistry,
         body_bytes_max: int,
         open_reads: bool,
@@ -70,8 +76,7 @@ class Guard:
         self._kept: OrderedDict[str, _Kept] = OrderedDict()
         self._running: set[str] = set()
         self._born_s: float | None = None
-        labels = ["method", "route", "status"]
-        self._requests = Counter("garden_http_requests_total", "Requests answered", labels, registry=registry)
+        self._requests = requests
         self._seconds = Histogram(
             "garden_http_request_seconds",
             "Time from request to answer",

@@ -4,45 +4,63 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import signal
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
-import h11
 import uvicorn
 from fastapi import FastAPI
-from uvicorn.protocols.http.h11_impl import H11Protocol
+from starlette.responses import Response
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from core.errors import ConfigError
 
 REQUEST_WITHIN_S = 5.0
 """A request, body included, must have come in within this many seconds of its first byte."""
 CONNECTIONS_MAX = 1000
-HEADER_BYTES_MAX = 16 * 1024
-_WAITING = (h11.IDLE, h11.SEND_BODY)
-_SLOW = (
-    b'{"title":"Request Timeout","status":408,"detail":"the request did not come in whole",'
-    b'"hint":"send head and body at once"}'
-)
-_BROKEN = b'{"title":"Bad Request","status":400,"detail":"this is not HTTP/1.1","hint":"speak HTTP/1.1, without TLS"}'
+HEAD_BYTES_MAX = 16 * 1024
+_SLOW = b'{"title":"Request Timeout","status":408,"detail":"the request did not come in whole"}'
+_BROKEN = b'{"title":"Bad Request","status":400,"detail":"this is not HTTP/1.1, or its head is too long"}'
+_PLAIN_GET = re.compile(rb"GET ([^ ?]+) HTTP/1\.1\r\n")
+_NOT_PLAIN = re.compile(rb"\r\n(?:if-|connection|expect|content-|transfer-|upgrade|range)", re.IGNORECASE)
 
 
-class ImpatientProtocol(H11Protocol):
-    """Closes connections whose request does not arrive."""
+class ImpatientProtocol(HttpToolsProtocol):
+    """Closes connections whose request does not arrive; answers the plainest reads from ready bytes."""
 
     _deadline: asyncio.TimerHandle | None = None
+    _head_bytes = 0
+    _in_head = True
+    _whole = True
+    """Nothing of a request has come that is not complete."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._deadline = self.loop.call_later(REQUEST_WITHIN_S, self._too_slow)
 
     def data_received(self, data: bytes) -> None:
+        if self._whole and self._answered_at_once(data):
+            return
         if self._deadline is None:
             self._deadline = self.loop.call_later(REQUEST_WITHIN_S, self._too_slow)
+        self._whole = False
         super().data_received(data)
-        if self.conn.their_state not in _WAITING:
+        if self._in_head:
+            self._head_bytes += len(data)
+            if self._head_bytes > HEAD_BYTES_MAX:
+                self._say_and_close(b"400 Bad Request", _BROKEN)
+        if self._whole:
             self._forget()
+
+    def on_headers_complete(self) -> None:
+        self._in_head = False
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        super().on_message_complete()
+        self._in_head, self._head_bytes, self._whole = True, 0, True
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._forget()
@@ -58,6 +76,25 @@ class ImpatientProtocol(H11Protocol):
     def send_400_response(self, msg: str) -> None:
         self._say_and_close(b"400 Bad Request", _BROKEN)
 
+    def _answered_at_once(self, data: bytes) -> bool:
+        """True when this was a whole, plain GET of a path that has ready bytes, and the answer is written."""
+        ready: dict[bytes, Callable[[], Response]] = self.config.ready  # type: ignore[attr-defined]
+        if not ready or (self.cycle is not None and not self.cycle.response_complete) or self.pipeline:
+            return False
+        plain = _PLAIN_GET.match(data)
+        make = ready.get(plain[1]) if plain else None
+        if make is None or data.find(b"\r\n\r\n") != len(data) - 4 or _NOT_PLAIN.search(data):
+            return False
+        self._forget()
+        self._unset_keepalive_if_required()
+        response = make()
+        head = [b"HTTP/1.1 %d OK\r\n" % response.status_code]
+        for name, value in (*self.server_state.default_headers, *response.raw_headers):
+            head += (name, b": ", value, b"\r\n")
+        self.transport.write(b"".join((*head, b"\r\n", response.body)))
+        self.timeout_keep_alive_task = self.loop.call_later(self.timeout_keep_alive, self.timeout_keep_alive_handler)
+        return True
+
     def _too_slow(self) -> None:
         self._deadline = None
         self._say_and_close(b"408 Request Timeout", _SLOW)
@@ -65,10 +102,10 @@ class ImpatientProtocol(H11Protocol):
     def _say_and_close(self, status: bytes, problem: bytes) -> None:
         if self.transport.is_closing():
             return
-        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
-            head = (
-                b"HTTP/1.1 %s\r\ncontent-type: application/problem+json\r\nconnection: close\r\ncontent-length: %d\r\n\r\n"
-            )
+        cycle = self.cycle
+        if cycle is None or cycle.response_complete or not cycle.response_started:
+            head = b"HTTP/1.1 %s\r\ncontent-type: application/problem+json\r\n"
+            head += b"connection: close\r\ncontent-length: %d\r\n\r\n"
             self.transport.write(head % (status, len(problem)) + problem)
         self.transport.close()
 
@@ -103,8 +140,8 @@ def make_server(app: FastAPI) -> Server:
         limit_concurrency=CONNECTIONS_MAX,
         timeout_keep_alive=30,
         timeout_graceful_shutdown=1,
-        h11_max_incomplete_event_size=HEADER_BYTES_MAX,
     )
+    config.ready = app.state.ready_bytes  # type: ignore[attr-defined]
     return Server(config)
 
 

@@ -9,11 +9,12 @@ import socket
 from collections.abc import Awaitable, Callable
 
 import pytest
+from starlette.responses import Response
 
 from core.clock import WallClock
 from core.errors import ConfigError, PeerDown
 from core.mesh import server as server_module
-from core.mesh.chassis import Health, body, create_app
+from core.mesh.chassis import Health, body, create_app, serve_ready
 from core.mesh.client import Mesh
 from core.mesh.events import EventLog
 from core.mesh.http import HttpTransport
@@ -35,6 +36,11 @@ async def with_server(story: Story, *loops: Callable[[], Awaitable[None]]) -> No
     async def takes_a_body(health: Health = body(Health)) -> Health:
         return health
 
+    @app.get("/ready")
+    async def careful() -> Health:
+        return Health(status="careful")
+
+    serve_ready(app, "/ready", lambda: Response("ready", media_type="text/plain"))
     sock = listen("127.0.0.1", 0)
     serving = asyncio.create_task(serve(Node("pot", "plant", app, loops), "", 0, sock=sock))
     try:
@@ -75,7 +81,8 @@ def test_requests_that_do_not_arrive_are_dropped(monkeypatch: pytest.MonkeyPatch
     [
         b"\x16\x03\x01\x02\x00\n\n",
         b"GET\r\n\r\n",
-        b"GET / HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nno colon here\r\n\r\n",
+        b"GET /\xff\xfe HTTP/1.1\r\nhost: a\r\n\r\n",
         b"GET / HTTP/1.1\r\nhost: a\r\nx: " + b"y" * 20000,
     ],
 )
@@ -180,3 +187,45 @@ def test_an_open_stream_does_not_keep_a_node_from_ending() -> None:
     streams: list[asyncio.StreamWriter] = []
     asyncio.run(go())
     assert ended_s[1] - ended_s[0] < 0.9
+
+
+async def ask_in_turn(port: int, *requests: bytes) -> list[bytes]:
+    """Over one connection; each answer's body."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    bodies = []
+    for request in requests:
+        writer.write(request)
+        head = await reader.readuntil(b"\r\n\r\n")
+        length = int(head.lower().partition(b"content-length: ")[2].partition(b"\r\n")[0])
+        bodies.append(await reader.readexactly(length))
+    writer.close()
+    return bodies
+
+
+def test_the_plainest_reads_are_answered_at_once_and_all_others_with_care() -> None:
+    plain, end = b"GET /ready HTTP/1.1\r\nhost: a\r\n", b"\r\n"
+    careful = b'{"status":"careful"}'
+
+    async def story(port: int) -> None:
+        odd = [plain + b"If-None-Match: x\r\n" + end, b"GET /ready?a=1 HTTP/1.1\r\nhost: a\r\n\r\n"]
+        answers = await ask_in_turn(port, plain + end, odd[0], plain + end, plain + b"content-length: 0\r\n" + end)
+        assert answers == [b"ready", careful, b"ready", careful]
+        assert (await ask_in_turn(port, odd[1]))[0] != b"ready"
+        told = (await ask_in_turn(port, b"GET /metrics HTTP/1.1\r\nhost: a\r\n\r\n"))[0]
+        assert b'garden_http_requests_total{method="GET",route="/ready",status="200"} 4.0' in told
+
+    asyncio.run(with_server(story))
+
+
+def test_pipelined_and_cut_requests_keep_their_order() -> None:
+    async def story(port: int) -> None:
+        get = b"GET /ready HTTP/1.1\r\nhost: a\r\n"
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(get + b"if-match: x\r\n\r\n" + get + b"\r\n")
+        for byte in get + b"connection: close\r\n\r\n":
+            writer.write(bytes([byte]))
+            await writer.drain()
+        assert (await reader.read(-1)).count(b'{"status":"careful"}') == 3
+        writer.close()
+
+    asyncio.run(with_server(story))
