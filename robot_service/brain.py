@@ -76,7 +76,8 @@ class Brain:
 
     # ------------------------------------------------------------------ readings
     def _idle(self) -> bool:
-        return self.robot.activity.job == "idle" and not self.queue.entries
+        charging = self.robot.activity.job == "charge" and bool(self.robot.where.docked_at)
+        return charging or (self.robot.activity.job == "idle" and not self.queue.entries)
 
     def _see(self, state: BodyState) -> None:
         if state.stopped != self._stopped:

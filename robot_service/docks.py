@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass, field
 
 from core.clock import Clock
@@ -39,6 +40,16 @@ class Docks:
     peers: Peers
     clock: Clock
     holds: dict[str, Hold] = field(default_factory=dict)
+    _news: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def news(self, within_s: float) -> None:
+        """Returns when a dock of ours is wanted or lost, or after `within_s`."""
+        self._news.clear()
+        try:
+            async with self.clock.timeout(within_s):
+                await self._news.wait()
+        except TimeoutError:
+            pass
 
     async def ask(self, dock: KnownDock, *, yielding: bool = False) -> str:
         """Reserve or renew; empty when granted, else the reason."""
@@ -64,10 +75,13 @@ class Docks:
             self.holds[dock.name] = Hold(dock, granted, until_s, yielding)
         else:
             hold.reservation, hold.until_s, hold.yielding, hold.lost = granted, until_s, yielding, ""
+        if granted.wanted_by:
+            self._news.set()
 
     def _lose(self, name: str, why: str) -> None:
         if (hold := self.holds.get(name)) is not None:
             hold.lost = why
+            self._news.set()
 
     def held(self, name: str) -> bool:
         """Ours, and not run out."""

@@ -25,7 +25,7 @@ from robot_service.skills.drive import drive_to, undock
 
 IDLE_LOOK_S = 2.0
 HOME_LOOK_S = 10.0
-"""At home, where only a neighbour on the move changes anything."""
+"""At home or on a dock, where only a neighbour changes anything."""
 HOME_M = 0.25
 AFTER_FAILURE_S = 5.0
 OWN_RETRY_S = 60.0
@@ -208,6 +208,8 @@ class Scheduler:
             return
         self.robot.body.rest(True)
         await self.robot.clock.sleep(IDLE_LOOK_S)
+        if hold is not None and not (hold.wanted_by or hold.lost):
+            await self.docks.news(HOME_LOOK_S - IDLE_LOOK_S)
 
     async def _stand_by(self) -> None:
         for name in list(self.docks.holds):

@@ -181,7 +181,7 @@ class Clockwork:
                 host.pump(now_s)
 
     def _stride_s(self) -> float:
-        due_s = min((host.due_s() for host in self._hosts), default=float("inf"))
+        due_s = min([host.due_s() for host in self._hosts], default=float("inf"))
         return min(max(due_s - self._world.time_s, STRIDE_S_MIN), STRIDE_S_MAX)
 
     async def _doze(self, clock: Clock, seconds: float) -> None:

@@ -58,6 +58,8 @@ class World:
         self.touch = Touch(self.model, self.data, tuple(self.robots))
         self._pot_discs: list[beams.Disc] = [(*pot.place, g.POT_RADIUS_M) for pot in self.pots.values()]
         self._owed_s = 0.0
+        self._still: bool | None = None
+        """Whether nothing moves; None until asked after a step."""
         for name, robot in self.robots.items():
             robot.docks, robot.press = self.docks, self.touch.pressed[name]
         self._settle()
@@ -80,7 +82,9 @@ class World:
         """Nothing is driven, pumped or poured, and nothing moves."""
         if self.tap_board.open or not all(robot.idle for robot in self.robots.values()):
             return False
-        return float(np.abs(self.data.qvel).max()) < STILL
+        if self._still is None:
+            self._still = float(np.abs(self.data.qvel).max()) < STILL
+        return self._still
 
     def advance(self, seconds: float) -> None:
         """Steps the world in control ticks of 20 ms; a remainder is kept for the next call."""
@@ -108,6 +112,7 @@ class World:
 
     def _look(self) -> None:
         """What devices may ask for after a tick."""
+        self._still = None
         for robot in self.robots.values():
             robot.after(self.docks)
         discs = {name: (r.pose.x_m, r.pose.y_m, g.BODY_RADIUS_M) for name, r in self.robots.items()}

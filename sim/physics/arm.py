@@ -33,6 +33,8 @@ class Arm:
 
     @property
     def idle(self) -> bool:
+        if self.target_rad == self.now_rad:
+            return True
         return all(abs(self.target_rad[n] - now) < SETTLED_RAD for n, now in self.now_rad.items())
 
     def pulse(self, channel: int, pulse_us: float) -> None:

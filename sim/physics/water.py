@@ -29,7 +29,7 @@ class Tank:
 
     def running(self, powered: bool) -> bool:
         """Does water leave the nozzle now?"""
-        asked = {PumpFault.OK: self.switched_on, PumpFault.STUCK_OFF: False, PumpFault.STUCK_ON: True}[self.fault]
+        asked = self.switched_on if self.fault is PumpFault.OK else self.fault is PumpFault.STUCK_ON
         return powered and asked and self.level_ml > 0.0
 
     def pump(self, seconds: float) -> float:
