@@ -24,7 +24,11 @@ HEAD_BYTES_MAX = 16 * 1024
 _SLOW = b'{"title":"Request Timeout","status":408,"detail":"the request did not come in whole"}'
 _BROKEN = b'{"title":"Bad Request","status":400,"detail":"this is not HTTP/1.1, or its head is too long"}'
 _PLAIN_GET = re.compile(rb"GET ([^ ?]+) HTTP/1\.1\r\n")
-_NOT_PLAIN = re.compile(rb"\r\n(?:if-|connection|expect|content-|transfer-|upgrade|range)", re.IGNORECASE)
+_NOT_PLAIN = re.compile(
+    rb"\r\n(?:if-|connection:(?! *keep-alive\r)|content-(?!type:|length: *0\r)|expect|transfer-|upgrade|range)",
+    re.IGNORECASE,
+)
+"""Headers that may change the answer, or what comes after it."""
 
 
 class ImpatientProtocol(HttpToolsProtocol):

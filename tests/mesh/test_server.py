@@ -208,11 +208,12 @@ def test_the_plainest_reads_are_answered_at_once_and_all_others_with_care() -> N
 
     async def story(port: int) -> None:
         odd = [plain + b"If-None-Match: x\r\n" + end, b"GET /ready?a=1 HTTP/1.1\r\nhost: a\r\n\r\n"]
-        answers = await ask_in_turn(port, plain + end, odd[0], plain + end, plain + b"content-length: 0\r\n" + end)
-        assert answers == [b"ready", careful, b"ready", careful]
+        answers = await ask_in_turn(port, plain + end, odd[0], plain + end, plain + b"Content-Length: 0\r\n" + end)
+        assert answers == [b"ready", careful, b"ready", b"ready"]
+        assert await ask_in_turn(port, plain + b"content-length: 00\r\n" + end, plain + end) == [careful, b"ready"]
         assert (await ask_in_turn(port, odd[1]))[0] != b"ready"
         told = (await ask_in_turn(port, b"GET /metrics HTTP/1.1\r\nhost: a\r\n\r\n"))[0]
-        assert b'garden_http_requests_total{method="GET",route="/ready",status="200"} 4.0' in told
+        assert b'garden_http_requests_total{method="GET",route="/ready",status="200"} 6.0' in told
 
     asyncio.run(with_server(story))
 
