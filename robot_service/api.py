@@ -66,7 +66,13 @@ def _readings(app: FastAPI, brain: Brain) -> None:
     async def position() -> Position:
         return brain.position()
 
-    @app.get("/history", summary="What happened and why", tags=["robot"], response_model=list[HistoryEntry])
+    @app.get(
+        "/history",
+        summary="What happened and why",
+        tags=["robot"],
+        response_model=list[HistoryEntry],
+        responses={200: {"content": {"text/csv": {}}}},
+    )
     async def history(
         after: Annotated[int, Query(ge=0, le=2**53)] = 0,
         format: Annotated[str, Query(pattern="^(json|csv)$")] = "json",
