@@ -21,8 +21,14 @@ REQUEST_WITHIN_S = 5.0
 """A request, body included, must have come in within this many seconds of its first byte."""
 CONNECTIONS_MAX = 1000
 HEAD_BYTES_MAX = 16 * 1024
-_SLOW = b'{"title":"Request Timeout","status":408,"detail":"the request did not come in whole"}'
-_BROKEN = b'{"title":"Bad Request","status":400,"detail":"this is not HTTP/1.1, or its head is too long"}'
+_SLOW = (
+    b'{"title":"Request Timeout","status":408,"detail":"the request did not come in whole",'
+    b'"hint":"send head and body at once"}'
+)
+_BROKEN = (
+    b'{"title":"Bad Request","status":400,"detail":"this is not HTTP/1.1, or its head is too long",'
+    b'"hint":"speak plain HTTP/1.1, with a head of at most 16 KiB"}'
+)
 _PLAIN_GET = re.compile(rb"GET ([^ ?]+) HTTP/1\.1\r\n")
 _NOT_PLAIN = re.compile(
     rb"\r\n(?:if-|connection:(?! *keep-alive\r)|content-(?!type:|length: *0\r)|expect|transfer-|upgrade|range)",
