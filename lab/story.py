@@ -25,6 +25,7 @@ DRY_RATIO, MOIST_RATIO = 0.175, 0.35
 DOSE_ML = 90.0
 """Twelve seconds of pumping: the soil of three litres rises by three hundredths, beyond the target."""
 SOAK_S = 40.0
+PUMP_ERROR_RATIO = 0.04
 STOP_WITHIN_S = 0.3
 TICK_S = 0.02
 STILL_MPS = 0.002
@@ -201,6 +202,11 @@ async def stops(garden: Garden, robot_id: str = "robot-1") -> float:
             moved_s = spent_s + TICK_S
     assert moved_s <= STOP_WITHIN_S + TICK_S + 1e-9, f"{robot_id} moved for {moved_s:.2f} s"
     return moved_s
+
+
+def allowed_ml(task: dict[str, Any]) -> float:
+    """The most that a task's permits let into the soil: a pump gives a few hundredths more or less than its calibration."""
+    return float(task["permits"]) * DOSE_ML * (1.0 + PUMP_ERROR_RATIO)
 
 
 def unhurt(garden: Garden) -> None:

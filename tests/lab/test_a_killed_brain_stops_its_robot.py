@@ -38,10 +38,10 @@ def test_everything_stands_in_0_3_s_and_the_pot_gets_no_more_than_its_permits(mo
         await story.stops(garden)
         await garden.clock.sleep(3.0)
         assert story.stands(story.robot(garden))
-        assert garden.truth().plant("plant-1").poured_ml <= story.DOSE_ML + 1.0
+        assert garden.truth().plant("plant-1").poured_ml <= story.DOSE_ML * (1 + story.PUMP_ERROR_RATIO)
         garden.start("robot-1")
         task = await story.served(garden, "plant-1")
-        assert garden.truth().plant("plant-1").poured_ml <= task["permits"] * story.DOSE_ML + 1.0
+        assert garden.truth().plant("plant-1").poured_ml <= story.allowed_ml(task)
         story.unhurt(garden)
 
     story.tell(story.one_pot(), told)

@@ -24,7 +24,7 @@ def test_a_dry_pot_asks_is_served_once_and_measures_that_it_was():
         before = garden.truth().plant("plant-1")
         task = await story.served(garden, "plant-1")
         after = garden.truth().plant("plant-1")
-        assert after.poured_ml == pytest.approx(story.DOSE_ML, abs=2.0)
+        assert after.poured_ml == pytest.approx(story.DOSE_ML, rel=story.PUMP_ERROR_RATIO)
         assert after.moisture_ratio - before.moisture_ratio == pytest.approx(story.DOSE_ML / 3000.0, abs=0.002)
         assert task["permits"] == 1
         assert task["delivered_ml"] == pytest.approx(story.DOSE_ML, abs=1.0)
@@ -47,7 +47,7 @@ def test_the_same_seed_tells_the_same_story_to_the_last_bit_and_another_seed_ano
 def test_every_base_and_way_of_docking_waters(variant):
     async def told(garden):
         await story.phase(garden, "plant-1", "soaking")
-        assert garden.truth().plant("plant-1").poured_ml == pytest.approx(story.DOSE_ML, abs=2.0)
+        assert garden.truth().plant("plant-1").poured_ml == pytest.approx(story.DOSE_ML, rel=story.PUMP_ERROR_RATIO)
         story.unhurt(garden)
 
     story.tell(story.one_pot(**variant), told)

@@ -91,7 +91,7 @@ def test_a_pot_killed_at_a_worst_instant_finishes_what_it_began(durable_s, miles
             assert known[task["task_id"]]["epoch"] >= task["epoch"]
             assert known[task["task_id"]]["permits"] == task["permits"]
         task = await story.served(garden, "plant-1")
-        assert garden.truth().plant("plant-1").poured_ml <= task["permits"] * story.DOSE_ML + 1.0
+        assert garden.truth().plant("plant-1").poured_ml <= story.allowed_ml(task)
         assert task["permits"] == 1
         story.unhurt(garden)
 
@@ -124,7 +124,7 @@ def test_a_body_that_comes_back_stops_its_devices_before_anything_else(moment):
         await story.when(garden, lambda: story.stands(story.robot(garden)), story.STOP_WITHIN_S)
         task = await story.served(garden, "plant-1")
         extra_ml = gardener.PUMP_MLPS * (dead_s + story.STOP_WITHIN_S)
-        assert garden.truth().plant("plant-1").poured_ml <= task["permits"] * story.DOSE_ML + extra_ml
+        assert garden.truth().plant("plant-1").poured_ml <= story.allowed_ml(task) + extra_ml
         assert garden.truth().spilt_ml == 0.0
 
     story.tell(story.one_pot(), told)

@@ -18,7 +18,7 @@ def docked(garden) -> bool:
 async def served_rightly(garden, within_s=400.0):
     """The task ends done, whatever it took, within its permits and without harm."""
     task = await story.served(garden, "plant-1", within_s)
-    assert garden.truth().plant("plant-1").poured_ml <= task["permits"] * story.DOSE_ML + 2.0
+    assert garden.truth().plant("plant-1").poured_ml <= story.allowed_ml(task)
     story.unhurt(garden)
     return task
 
@@ -108,7 +108,7 @@ def test_a_pot_whose_probe_lies_stops_asking_and_says_why(kind, doses):
         await garden.clock.sleep(60.0)
         poured_ml = garden.truth().plant("plant-1").poured_ml
         await garden.clock.sleep(30.0)
-        assert garden.truth().plant("plant-1").poured_ml == poured_ml <= doses * (story.DOSE_ML + 1.0)
+        assert garden.truth().plant("plant-1").poured_ml == poured_ml <= doses * story.DOSE_ML * (1 + story.PUMP_ERROR_RATIO)
         garden.rig.faults.remove(fault.id)
         assert (await story.ended(garden, "plant-1"))["state"] in ("done", "cancelled")
         story.unhurt(garden)

@@ -114,7 +114,7 @@ def test_a_stop_while_it_pumps_is_the_end_of_that_dose():
         assert garden.truth().plant("plant-1").poured_ml == poured_ml < 45.0
         await garden.post("robot-1", "/resume", {})
         task = await story.served(garden, "plant-1", 400.0)
-        assert garden.truth().plant("plant-1").poured_ml <= task["permits"] * story.DOSE_ML + 1.0
+        assert garden.truth().plant("plant-1").poured_ml <= story.allowed_ml(task)
         story.unhurt(garden)
 
     story.tell(story.one_pot(), told)

@@ -23,7 +23,7 @@ def test_four_robots_water_twelve_pots_and_never_touch(seed):
         watch.cancel()
         assert {task["robot_id"] for task in tasks} == {robot.id for robot in garden.scenario.robots}
         for task in tasks:
-            assert garden.truth().plant(task["plant_id"]).poured_ml <= task["permits"] * (story.DOSE_ML + 1.0)
+            assert garden.truth().plant(task["plant_id"]).poured_ml <= story.allowed_ml(task)
         assert nearest[0] >= story.TOUCHING_M
         print("all watered after", round(max(task["updated_s"] for task in tasks)), "s; nearest", round(nearest[0], 3), "m")
         story.unhurt(garden)
