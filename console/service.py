@@ -22,6 +22,8 @@ from core.wire.market import Task, TaskRequest
 from core.wire.robot import Stopped, StopRequest
 
 D = TypeVar("D", bound=Document)
+PICTURE_WITHIN_S = 20.0
+"""The world's first picture takes seconds: it loads its kernels."""
 FRESH_S = 0.5
 """A snapshot serves everybody who asks within this time."""
 PAGE = FilePath(__file__).with_name("page.html")
@@ -89,7 +91,7 @@ def _add_reads(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
         worlds = peers.of_kind("sim")
         if not worlds:
             raise NotFound("a real garden has no simulated world", hint="look out of the window")
-        answer = await mesh.exchange(worlds[0], "GET", "/overview.jpg")
+        answer = await mesh.exchange(worlds[0], "GET", "/overview.jpg", timeout_s=PICTURE_WITHIN_S)
         if answer.status != 200:
             raise PeerDown(f"{worlds[0].id} gave no picture (status {answer.status})")
         return Response(answer.body, media_type="image/jpeg", headers={"cache-control": "no-store"})
