@@ -66,26 +66,8 @@ class PlantState(Document):
     card: PlantCard
 
 
-class Fruit(Document):
-    """One fruit of the inventory: the paper's five, the position in the plant frame, first and last seen."""
-
-    fruit_id: Identifier
-    colour: Colour
-    confidence: Ratio
-    x_m: Annotated[float, Field(ge=-5, le=5)]
-    y_m: Annotated[float, Field(ge=-5, le=5)]
-    z_m: Annotated[float, Field(ge=-5, le=5)]
-    radius_m: Annotated[float, Field(gt=0, le=0.2)]
-    robot_pose: Pose2 | None = None
-    """Base pose relative to the plant when it was seen."""
-    image_x_px: Pixels | None = None
-    image_y_px: Pixels | None = None
-    first_seen_s: GardenSeconds = 0.0
-    last_seen_s: GardenSeconds = 0.0
-
-
 class NewFruit(Document):
-    """`POST /inventory/fruits`."""
+    """`POST /inventory/fruits`: the paper's five and the position in the plant frame."""
 
     colour: Colour
     confidence: Ratio = 0.75
@@ -94,8 +76,17 @@ class NewFruit(Document):
     z_m: Annotated[float, Field(ge=-5, le=5)]
     radius_m: Annotated[float, Field(gt=0, le=0.2)]
     robot_pose: Pose2 | None = None
+    """Base pose relative to the plant when it was seen."""
     image_x_px: Pixels | None = None
     image_y_px: Pixels | None = None
+
+
+class Fruit(NewFruit):
+    """One fruit of the inventory, with its identity and when it was first and last seen."""
+
+    fruit_id: Identifier
+    first_seen_s: GardenSeconds = 0.0
+    last_seen_s: GardenSeconds = 0.0
 
 
 class Scan(Document):
