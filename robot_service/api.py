@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from typing import Annotated
 
 from fastapi import FastAPI, Path, Query, Response
 
+from core.history import as_csv
 from core.mesh.auth import ROLES, Caller, Verifier
 from core.mesh.chassis import allow, body, create_app
 from core.wire.documents import HistoryEntry
@@ -74,19 +73,11 @@ def _readings(app: FastAPI, brain: Brain) -> None:
         responses={200: {"content": {"text/csv": {}}}},
     )
     async def history(
-        after: Annotated[int, Query(ge=0, le=2**53)] = 0,
+        since: Annotated[int, Query(ge=0, le=2**53, description="entries after this id")] = 0,
         format: Annotated[str, Query(pattern="^(json|csv)$")] = "json",
     ) -> object:
-        entries = brain.events.since(after)
-        return _csv(entries) if format == "csv" else entries
-
-
-def _csv(entries: list[HistoryEntry]) -> Response:
-    out = io.StringIO()
-    rows = csv.writer(out)
-    rows.writerow(["id", "t_s", "kind", "what", "task_id"])
-    rows.writerows([e.id, f"{e.t_s:.3f}", e.kind, e.what, e.task_id] for e in entries)
-    return Response(out.getvalue(), media_type="text/csv")
+        entries = brain.events.since(since)
+        return Response(as_csv(entries), media_type="text/csv") if format == "csv" else entries
 
 
 def _jobs(app: FastAPI, brain: Brain) -> None:
