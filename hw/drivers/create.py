@@ -173,10 +173,16 @@ class CreateDriver(Session):
         self._seeking = False
         now_s = self._clock.now()
         seen = self._reading.oi_mode if self._reading is not None else -1
-        dropped = seen != self._active_mode and now_s - self._mode_sent_s > MODE_GRACE_S
-        if self._mode is not self._active_mode or dropped:
+        mode = self._driving_mode()
+        dropped = seen != mode and now_s - self._mode_sent_s > MODE_GRACE_S
+        if self._mode is not mode or dropped:
             self._rims_sent_s = -math.inf
-            self._tell_mode(self._active_mode, Op.FULL if self._active_mode is Mode.FULL else Op.SAFE)
+            self._tell_mode(mode, Op.FULL if mode is Mode.FULL else Op.SAFE)
+
+    def _driving_mode(self) -> Mode:
+        """Safe lets the base itself stop at an edge, even with a dead wire; only Full can leave a dock's live contacts."""
+        on_contacts = self._reading is not None and self._reading.home_base
+        return Mode.FULL if on_contacts else self._active_mode
 
     def _tell_mode(self, mode: Mode, op: Op) -> None:
         if self._send(wire.bare(op)):
@@ -184,7 +190,7 @@ class CreateDriver(Session):
 
     def _halt(self, *, again: bool) -> None:
         """Zero rims in our mode, Start in Passive when something may be moving."""
-        if self._mode is self._active_mode:
+        if self._mode in (Mode.SAFE, Mode.FULL):
             self._send_rims((0, 0), again=again)
         elif self._seeking or again:
             self._seeking = False

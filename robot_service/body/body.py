@@ -21,7 +21,7 @@ from hw.drivers.ssc32 import Ssc32Driver
 from hw.drivers.stargazer import StargazerDriver
 from hw.links import Opener
 from hw.ports import Base, Localizer, ServoBoard
-from hw.protocols.create import Model
+from hw.protocols.create import Mode, Model
 from robot_service.body.actuators import Actuators
 from robot_service.body.caps import Ledger, StopLatch
 from robot_service.body.gate import GateState, Verdict, check
@@ -261,6 +261,7 @@ def make_drivers(settings: BodySettings, clock: Clock, opener: Opener) -> Driver
             clock,
             wheelbase_m=gardener.WHEELBASE_M[settings.create],
             wheel_diameter_m=gardener.WHEEL_DIAMETER_M[settings.create],
+            mode=Mode.SAFE,
         ),
         servos=Ssc32Driver(settings.servo_url, opener, clock, outputs=(gardener.PUMP_CHANNEL,)),
         localizer=StargazerDriver(settings.marker_url, opener, clock),

@@ -22,7 +22,15 @@ def nearly_done(garden) -> bool:
 
 
 @pytest.mark.parametrize("way", [HEARS, IS_HEARD], ids=["no answers", "no requests"])
-@pytest.mark.parametrize(("moment", "for_s"), [(on_dock, 4.0), (on_dock, 25.0), (pumps, 25.0), (nearly_done, 6.0)])
+@pytest.mark.parametrize(
+    ("moment", "for_s"),
+    [
+        pytest.param(on_dock, 4.0, marks=pytest.mark.soak),
+        (on_dock, 25.0),
+        pytest.param(pumps, 25.0, marks=pytest.mark.soak),
+        (nearly_done, 6.0),
+    ],
+)
 def test_silence_round_the_act_never_becomes_a_second_dose(way, moment, for_s):
     async def told(garden):
         await story.when(garden, lambda: moment(garden))

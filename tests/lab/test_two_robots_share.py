@@ -63,7 +63,7 @@ def both_ready(garden):
     return garden.until(ready, 10.0)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1])
 def test_crossing_robots_give_way_and_both_arrive(seed):
     async def told(garden):
         assert await both_ready(garden)
@@ -75,7 +75,7 @@ def test_crossing_robots_give_way_and_both_arrive(seed):
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("seed", range(10, 22))
+@pytest.mark.parametrize("seed", range(2, 14))
 def test_crossing_robots_give_way_whatever_the_seed(seed):
     async def told(garden):
         assert await both_ready(garden)
