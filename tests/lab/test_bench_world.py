@@ -14,17 +14,21 @@ def test_physics_rows_stand_beside_bare_mujoco():
     assert [row["name"] for row in rows] == ["world.physics_idle_x", "world.physics_driving_x"]
     for row in rows:
         assert row.keys() == KEYS
-        assert row["ours"] > 0 and row["peer"] > 0 and row["ratio"] == row["ours"] / row["peer"]
+        assert row["ours"] > 0
+        assert row["peer"] > 0
+        assert row["ratio"] == row["ours"] / row["peer"]
         assert row["ok"] is (row["ours"] >= float(row["target"].split()[-1]))
 
 
 def test_a_shorter_day_says_so_instead_of_being_scaled():
     row = bench_quiet_day(seconds=30.0)
-    assert row.keys() == KEYS and row["peer"] is None
+    assert row.keys() == KEYS
+    assert row["peer"] is None
     assert row["unit"] == "CPU s / 30 garden s"
     assert 0 < row["ours"] < 30.0
 
 
 def test_a_process_counts_with_its_children():
     burnt = sum(i * i for i in range(2_000_000))
-    assert burnt > 0 and _family_cpu_s(os.getpid()) > 0
+    assert burnt > 0
+    assert _family_cpu_s(os.getpid()) > 0
