@@ -294,7 +294,7 @@ class Market:
         self._award(task, best.robot_id, cost_s, bids, f"cheapest of {len(bids)}: {cost_s:.1f} s", now_s)
 
     def _nobody(self, task: Task, live: Live, bids: list[Bid], now_s: float) -> None:
-        live.backoff_s = min(max(self.rules.backoff_s_min, 2.0 * live.backoff_s), self.rules.backoff_s_max)
+        live.backoff_s = min(max(self.rules.backoff_s_min, 2.0 * live.backoff_s), self.rules.ask_again_s_max)
         live.next_ask_s = now_s + live.backoff_s
         why = told(bids)[:400]
         if why != live.told:

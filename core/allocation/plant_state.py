@@ -32,6 +32,9 @@ class Rules:
     permit_valid_s: float = permits.PERMIT_VALID_S
     backoff_s_min: float = 1.0
     backoff_s_max: float = 30.0
+    """After failures."""
+    ask_again_s_max: float = 8.0
+    """While nobody can: robots that just started are heard of soon, and a question costs little."""
     resend_s: float = 1.0
     """An award that nobody acknowledged is sent again this often until the lease ends."""
     run_s_max: float = 900.0

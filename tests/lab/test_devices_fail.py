@@ -47,7 +47,9 @@ def test_a_robot_whose_other_devices_fall_silent_stands_within_their_patience(de
     story.tell(story.one_pot(), told)
 
 
-@pytest.mark.parametrize("device", ["create", "ssc32", "stargazer"])
+@pytest.mark.parametrize(
+    "device", ["create", *(pytest.param(name, marks=pytest.mark.soak) for name in ("ssc32", "stargazer"))]
+)
 def test_noise_on_a_wire_costs_time_and_nothing_else(device):
     async def told(garden):
         story.fault(garden, "serial_noise", f"robot-1.{device}", 120.0, 0.002)
