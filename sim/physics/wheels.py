@@ -45,8 +45,7 @@ class _Creep:
         self.roll(0.0, 1.0)
 
     def roll(self, speed_mps: float, slip_factor: float) -> None:
-        damping = self._per_speed / (max(abs(speed_mps), ROLLING_MPS_MIN) * slip_factor)
-        damping = min(DAMPING_MAX, damping)
+        damping = min(DAMPING_MAX, self._per_speed / max(abs(speed_mps), ROLLING_MPS_MIN)) / slip_factor
         if damping != self._damping:
             self._damping = damping
             self._row[0] = -1.0
