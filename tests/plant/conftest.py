@@ -269,6 +269,7 @@ class Garden:
         self, plant_id: str, method: str, path: str, *, who: str = "operator", role: str = "operator", **more: Any
     ) -> httpx.Response:
         headers = {"authorization": f"Bearer {token(who, role)}"} | more.pop("headers", {})
+        await asyncio.sleep(0)  # a node's loops begin before its first request comes in: only then do they clean up
         transport = httpx.ASGITransport(self.nodes[plant_id].app)
         async with httpx.AsyncClient(transport=transport, base_url=f"http://{plant_id}") as client:
             return await client.request(method, path, headers=headers, **more)
