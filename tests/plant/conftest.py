@@ -245,6 +245,7 @@ class Garden:
 
     async def kill_pot(self, plant_id: str = "plant-1") -> None:
         loops = self.loops.pop(plant_id)
+        await asyncio.sleep(0)  # a task cancelled before its first step cleans nothing up
         for task in loops:
             task.cancel()
         await asyncio.gather(*loops, return_exceptions=True)
@@ -269,7 +270,6 @@ class Garden:
         self, plant_id: str, method: str, path: str, *, who: str = "operator", role: str = "operator", **more: Any
     ) -> httpx.Response:
         headers = {"authorization": f"Bearer {token(who, role)}"} | more.pop("headers", {})
-        await asyncio.sleep(0)  # a node's loops begin before its first request comes in: only then do they clean up
         transport = httpx.ASGITransport(self.nodes[plant_id].app)
         async with httpx.AsyncClient(transport=transport, base_url=f"http://{plant_id}") as client:
             return await client.request(method, path, headers=headers, **more)
