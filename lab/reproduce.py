@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from core.errors import ConfigError
+from lab.quiet import hush
 from lab.results import Result
 
 EXPERIMENTS = {
@@ -37,6 +38,7 @@ def run_experiment(name: str, trials: int | None, seed: int, swap: str | None, p
     """Run one experiment by name; raises ConfigError for an unknown one."""
     if name not in EXPERIMENTS:
         raise ConfigError(f"no experiment {name!r}", hint=f"one of: {', '.join(EXPERIMENTS)}")
+    hush()
     experiment: Callable[..., Result] = load_object(EXPERIMENTS[name])
     return experiment(trials=trials, seed=seed, swap=load_object(swap) if swap else None, progress=progress)
 

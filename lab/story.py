@@ -11,13 +11,12 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import structlog
-
 from core.robots import gardener
 from core.scenario import Plant, Robot, Scenario, find
 from core.virtual import run_virtual
 from core.wire.market import FINAL_STATES
 from lab.garden import Garden
+from lab.quiet import hush
 from sim.faults import Fault, FaultRequest
 from sim.truth import RobotTruth
 
@@ -76,7 +75,7 @@ async def growing(scenario: Scenario, seed: int | None = None, **more: Any) -> A
 
 def tell(scenario: Scenario, story: Story, seed: int | None = None) -> None:
     """Play a story in a garden on virtual time."""
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(50))
+    hush()
     print(f"seed {scenario.seed if seed is None else seed}")
 
     async def play() -> None:

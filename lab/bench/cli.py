@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from core.errors import ConfigError
+from lab.quiet import hush
 from lab.reproduce import load_object
 
 BENCHES = {
@@ -29,6 +30,7 @@ def run_bench(name: str, n: int) -> list[Row]:
     """One bench's rows; raises ConfigError for an unknown one."""
     if name not in BENCHES:
         raise ConfigError(f"no bench {name!r}", hint=f"one of: {', '.join(BENCHES)}")
+    hush()
     bench: Callable[[int], list[Row]] = load_object(BENCHES[name])
     return bench(n)
 

@@ -6,7 +6,6 @@ is disturbed least.
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import statistics
@@ -21,7 +20,6 @@ from typing import Any
 
 import httpx
 import mujoco
-import structlog
 
 from console import toml
 from console.folder import Folder
@@ -31,6 +29,7 @@ from core.errors import ConfigError
 from core.scenario import Scenario, find
 from core.virtual import run_virtual
 from lab.garden import Garden
+from lab.quiet import hush
 from sim.scene.build import DT_S
 from sim.world import World
 
@@ -133,7 +132,7 @@ def _with_moisture(scenario: Scenario, ratio: float) -> Scenario:
 
 
 def _virtual(main: Callable[[Path], Any]) -> float:
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    hush()
     with tempfile.TemporaryDirectory() as folder:
         return float(run_virtual(main(Path(folder))))
 

@@ -18,13 +18,12 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import structlog
-
 from core.errors import ConfigError
 from core.scenario import Plant, Scenario, find
 from core.virtual import run_virtual
 from core.wire.market import FINAL_STATES
 from lab.garden import Garden
+from lab.quiet import hush
 from lab.results import Result, held
 from sim.truth import Collisions, PlantTruth
 
@@ -74,7 +73,7 @@ def one_dry_pot(plant_id: str) -> Scenario:
 
 def trial(seed: int, plant_id: str) -> Trial:
     """One whole story in a garden of its own; a picklable unit of work for a pool."""
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(50))
+    hush()
     with tempfile.TemporaryDirectory() as folder:
         return run_virtual(_trial(seed, plant_id, Path(folder)))
 
