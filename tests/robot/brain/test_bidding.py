@@ -109,6 +109,7 @@ def test_an_unreachable_dock_is_refused():
     assert "no way" in price(asked("nowhere"), ME).reason
 
 
-def test_more_than_a_tankful_is_refused():
-    assert "tank holds" in price(asked(dose_ml=500.0), replace(ME, tank_ml=gardener.TANK_ML)).reason or True
-    assert price(asked(dose_ml=500.0), ME).cost_s is not None
+def test_the_largest_dose_is_taken_but_more_than_a_tankful_is_refused():
+    largest = asked(dose_ml=500.0)
+    assert price(largest, ME).cost_s is not None
+    assert "tank holds" in price(largest.model_copy(update={"dose_ml": 2 * gardener.TANK_ML}), ME).reason
