@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -176,10 +176,7 @@ class Garden:
                 self._crashed.set_exception(error)
 
     async def _live(self, running: Running) -> None:
-        loops = self._build(running)
-        async with asyncio.TaskGroup() as group:
-            for loop in loops:
-                group.create_task(_run(loop))
+        await _all(self._build(running))
 
     def _start_world(self) -> None:
         process = self._processes["sim"]
@@ -261,7 +258,7 @@ async def _run(loop: Loop) -> None:
     await loop()
 
 
-async def _all(loops: Any) -> None:
+async def _all(loops: Iterable[Loop]) -> None:
     async with asyncio.TaskGroup() as group:
         for loop in loops:
             group.create_task(_run(loop))

@@ -25,7 +25,7 @@ from core.wire.market import FINAL_STATES
 from lab.garden import Garden
 from lab.quiet import hush
 from lab.results import Result, held
-from sim.truth import Collisions, PlantTruth
+from sim.truth import Collisions
 
 TRIALS = 10
 NEAR, FAR = "plant-1", "plant-4"
@@ -80,7 +80,7 @@ def trial(seed: int, plant_id: str) -> Trial:
 
 async def _trial(seed: int, plant_id: str, folder: Path) -> Trial:
     async with Garden(one_dry_pot(plant_id), folder, seed=seed) as garden:
-        before = _plant(garden, plant_id)
+        before = garden.truth().plant(plant_id)
         times: dict[str, float] = {}
         task: dict[str, Any] = {}
 
@@ -91,7 +91,8 @@ async def _trial(seed: int, plant_id: str, folder: Path) -> Trial:
             return task.get("state") in FINAL_STATES
 
         await garden.until(over, TRIAL_WITHIN_S, every_s=0.5)
-        after, truth = _plant(garden, plant_id), garden.truth()
+        truth = garden.truth()
+        after = truth.plant(plant_id)
         return Trial(
             seed=seed,
             plant_id=plant_id,
@@ -122,10 +123,6 @@ def _note_times(garden: Garden, task: dict[str, Any], times: dict[str, float]) -
 def _hits(touches: Collisions) -> int:
     """What must not be touched; a nudge of the dock's face is part of docking."""
     return touches.robot_robot + touches.robot_pot + touches.arm
-
-
-def _plant(garden: Garden, plant_id: str) -> PlantTruth:
-    return garden.truth().plant(plant_id)
 
 
 def watering(trials: int | None, seed: int, swap: object, progress: Tell) -> Result:
