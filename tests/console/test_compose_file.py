@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
 import sys
+from copy import deepcopy
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 import yaml
 
@@ -21,9 +25,40 @@ KNOWN = {
 }  # fmt: skip
 
 
+SCHEMA: dict[str, Any] = json.loads(
+    files("check_jsonschema").joinpath("builtin_schemas", "vendor", "compose-spec.json").read_text()
+)
+"""The compose specification's own, as `check-jsonschema` carries it; so nothing is fetched."""
+
+
+def judged(document: object) -> list[str]:
+    """What the compose specification has against a document: paths of what is wrong."""
+    judge = jsonschema.validators.validator_for(SCHEMA)(SCHEMA)
+    return sorted(error.json_path for error in judge.iter_errors(document))
+
+
 def mounts(service: dict[str, Any]) -> dict[str, str]:
     """Target to volume."""
     return {volume.split(":")[1]: volume.split(":")[0] for volume in service["volumes"]}
+
+
+def test_the_compose_specification_has_nothing_against_it() -> None:
+    assert judged(DOCUMENT) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "bad"),
+    [
+        ("restarts", "always"),
+        ("depends_on", {"sim": {"condition": "service_happy"}}),
+        ("healthcheck", {"start_interval": 1.5}),
+        ("cap_drop", "ALL"),
+    ],
+)
+def test_the_compose_specification_would_find_a_slip(key: str, bad: object) -> None:
+    document = deepcopy(DOCUMENT)
+    document["services"]["plant-1"][key] = bad
+    assert any(path.startswith("$.services") for path in judged(document))
 
 
 def test_only_known_keys_and_one_image() -> None:
