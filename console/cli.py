@@ -53,7 +53,10 @@ def _add(name: str) -> None:
 HELP = {
     "bench": "Measure ours and a peer side by side.",
     "emulate": "One device's emulator on a pseudo-terminal.",
+    "evaluate": "Judge a detector on labelled images.",
     "reproduce": "Run a paper's experiment, ours beside the paper's.",
+    "see": "What a detector makes of one image.",
+    "train": "Fit a detector again from labelled images.",
 }
 
 

@@ -1,0 +1,1 @@
+"""Seeing fruit: detectors as pure functions of an image, found by name, and how they are judged."""

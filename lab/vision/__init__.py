@@ -1,0 +1,1 @@
+"""Seeing, tried out: labelled photographs, rendered frames, measuring, fitting and training."""
