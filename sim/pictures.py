@@ -73,13 +73,12 @@ class Pictures:
         geoms = replace(geoms, visible=visible)
         eye = model.camera(f"{robot_id}/eye").id
         T_world_cam = _pose(data.cam_xpos[eye], data.cam_xmat[eye].reshape(3, 3) @ _TO_OPENCV)
-        fov_y_deg = float(model.cam_fovy[eye])
         lamps_m, lamps_rgb = np.array(data.light_xpos), np.array(model.light_diffuse, dtype=np.float64)
 
         def job() -> bytes:
             from sim.camera import hand, overview
 
-            camera = hand.camera(width, height, fov_y_deg)
+            camera = hand.camera(width, height)
             light = hand.light_of(lamps_m, lamps_rgb)
             return overview.jpeg(hand.draw(camera, T_world_cam, geoms, paint, light))
 

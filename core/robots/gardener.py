@@ -104,7 +104,11 @@ HAND_M = 0.13
 """Wrist axis to tool point: between the fingers, and where the nozzle lets go of the water."""
 GRIPPER_OPEN_M = 0.044
 CAMERA_IN_HAND_M = (0.03, 0.0, 0.045)
-"""Camera centre from the wrist axis along (hand x, y, z); it looks along hand x."""
+"""Camera centre from the wrist axis along (hand x, y, z); it looks along hand x, its picture's top is hand z."""
+CAMERA_PIXELS = (640, 480)
+"""Its largest picture, width and height; it can give half of that."""
+CAMERA_FOV_Y_DEG = 48.0
+"""From the picture's top to its bottom."""
 NOZZLE_IN_HAND_M = (0.11, 0.0, -0.02)
 
 ARM_HOME_RAD = (0.0, math.radians(150.0), math.radians(-150.0), math.radians(60.0))

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from sim.camera.camera import Camera, from_fov
+import math
+
+from core.geometry.pinhole import Camera, from_fov
+from core.robots.gardener import CAMERA_FOV_Y_DEG, CAMERA_PIXELS
 from sim.camera.geoms import Floats, Geoms, Paint
 from sim.camera.raster import rasterise
 from sim.camera.shade import Lamp, Light, Picture, shade
 
 LAMPS_TOTAL = 0.95
 """What all lamps together give to a surface that faces them."""
-_WIDTH, _HEIGHT = 640, 480
 
 
-def camera(width: int, height: int, fov_y_deg: float) -> Camera:
-    """The 640 x 480 camera of this field of view, read out at another size."""
-    return from_fov(_WIDTH, _HEIGHT, fov_y_deg).scaled(width, height)
+def camera(width: int, height: int) -> Camera:
+    """The gardener's camera, read out at this size."""
+    return from_fov(*CAMERA_PIXELS, math.radians(CAMERA_FOV_Y_DEG)).scaled(width, height)
 
 
 def light_of(lamps_m: Floats, lamps_rgb: Floats) -> Light:

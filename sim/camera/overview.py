@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sim.camera.camera import Camera, from_fov, look_at, project
+from core.geometry.pinhole import Camera, from_fov, look_at, project
 from sim.camera.geoms import Floats, Geoms, Paint
 from sim.camera.raster import rasterise
 from sim.camera.shade import Lamp, Light, Picture, cast_shadow, shade
@@ -48,7 +48,7 @@ class Arena:
 
 def view_of(arena: Arena) -> tuple[Camera, Floats]:
     """Camera and T_world_cam (4, 4) that hold the arena and the shrubs in the frame."""
-    camera = from_fov(WIDTH, HEIGHT, FOV_Y_DEG)
+    camera = from_fov(WIDTH, HEIGHT, math.radians(FOV_Y_DEG))
     near, far = 1.0, 80.0
     for _ in range(30):
         middle = (near + far) / 2

@@ -15,13 +15,14 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from sim.camera.camera import Camera, directions
+from core.geometry.pinhole import Camera, directions
 from sim.camera.geoms import Floats, Geoms, Ints
 
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6
 """mjtGeom; other kinds (height fields, meshes) are not drawn."""
 _NEAR_M = 1e-4
 _TINY = 1e-15
+_SLACK = 1e-9
 
 _jit = numba.njit(cache=True, nogil=True, fastmath=False)
 _jit_inline = numba.njit(cache=True, nogil=True, fastmath=False, inline="always")
@@ -46,11 +47,24 @@ def rasterise(camera: Camera, T_world_cam: Floats, geoms: Geoms) -> Raster:
     distance_m = np.full(shape, np.inf)
     normal = np.zeros((*shape, 3), dtype=np.float32)
     rays = directions(camera)
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    columns, rows = _ranges(rays)
     T = np.ascontiguousarray(T_world_cam, dtype=np.float64)
-    _draw(T, lens, rays, geoms.kind, geoms.size, geoms.pos, geoms.mat, geoms.visible, ids, distance_m)
+    _draw(T, columns, rows, rays, geoms.kind, geoms.size, geoms.pos, geoms.mat, geoms.visible, ids, distance_m)
     _normals(T, rays, geoms.kind, geoms.size, geoms.pos, geoms.mat, ids, distance_m, normal)
     return Raster(ids=ids, distance_m=distance_m, normal=normal)
+
+
+def _ranges(rays: Floats) -> tuple[Floats, Floats]:
+    """What the rays of each column span in x at depth 1, and those of each row in y: (2, W) and (2, H), lower and upper.
+
+    Both never fall from left to right, so that a search finds a geom's columns whatever the lens does.
+    """
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    return _rising(x.min(axis=0), x.max(axis=0)), _rising(y.min(axis=1), y.max(axis=1))
+
+
+def _rising(lower: Floats, upper: Floats) -> Floats:
+    return np.stack([np.minimum.accumulate(lower[::-1])[::-1], np.maximum.accumulate(upper)])
 
 
 @_jit_inline
@@ -225,17 +239,18 @@ def _outline(kind: int, R: Floats, c: Floats, size: Floats, extent: Floats) -> i
 
 
 @_jit
-def _span(low: float, high: float, f: float, centre: float, count: int) -> tuple[int, int]:
-    """Pixel range [first, last) that covers low..high at depth 1, one pixel to spare."""
-    first = max(0.0, min(math.floor(low * f + centre), float(count)))
-    last = max(0.0, min(math.ceil(high * f + centre) + 1.0, float(count)))
-    return int(first), int(last)
+def _span(low: float, high: float, reach: Floats) -> tuple[int, int]:
+    """Range [first, last) of the columns or rows (`_ranges`) whose rays can meet low..high at depth 1."""
+    first = int(np.searchsorted(reach[1], low - _SLACK))
+    last = int(np.searchsorted(reach[0], high + _SLACK, side="right"))
+    return first, max(first, last)
 
 
 @_jit
 def _draw(
     T: Floats,
-    lens: Floats,
+    columns: Floats,
+    rows: Floats,
     rays: Floats,
     kinds: Ints,
     sizes: Floats,
@@ -269,8 +284,8 @@ def _draw(
             continue
         u0, u1, v0, v1 = 0, width, 0, height
         if seen == 1:
-            u0, u1 = _span(extent[0], extent[1], lens[0], lens[2], width)
-            v0, v1 = _span(extent[2], extent[3], lens[1], lens[3], height)
+            u0, u1 = _span(extent[0], extent[1], columns)
+            v0, v1 = _span(extent[2], extent[3], rows)
         for v in range(v0, v1):
             for u in range(u0, u1):
                 x, y, z = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from sim.camera.camera import Camera, directions, from_fov, look_at
+from core.geometry.pinhole import Camera, directions, from_fov, look_at
 from sim.camera.geoms import ASTROTURF, LAMP, LEAF, SOIL, Floats, Geoms, Ints, Paint
 from sim.camera.raster import Raster, rasterise
 
@@ -58,8 +58,8 @@ class ShadowMap:
 def cast_shadow(lamp: Lamp, geoms: Geoms, centre_m: Sequence[float], reach_m: float) -> ShadowMap:
     """What the lamp sees of the sphere of `reach_m` round `centre_m`."""
     eye, target = np.array(lamp.pos_m), np.array(centre_m, dtype=np.float64)
-    fov_deg = 2 * math.degrees(math.asin(min(0.99, reach_m / float(np.linalg.norm(target - eye)))))
-    camera = from_fov(SHADOW_PIXELS, SHADOW_PIXELS, fov_deg)
+    fov_rad = 2 * math.asin(min(0.99, reach_m / float(np.linalg.norm(target - eye))))
+    camera = from_fov(SHADOW_PIXELS, SHADOW_PIXELS, fov_rad)
     T_world_lamp = look_at(eye, target, np.array([0.0, 1.0, 0.01]))
     return ShadowMap(camera=camera, T_world_lamp=T_world_lamp, distance_m=rasterise(camera, T_world_lamp, geoms).distance_m)
 
@@ -162,7 +162,7 @@ def _lit(p: Floats, lens: Floats, T_world_lamp: Floats, depths: Floats) -> float
     if z <= 0:
         return 1.0
     distance = math.sqrt(x * x + y * y + z * z)
-    u, v = round(lens[0] * x / z + lens[2]), round(lens[1] * y / z + lens[3])
+    u, v = math.floor(lens[0] * x / z + lens[2]), math.floor(lens[1] * y / z + lens[3])
     if not (1 <= u < width - 1 and 1 <= v < height - 1):
         return 1.0
     seen = 0

@@ -185,7 +185,7 @@ def _hand(spec: Any, hand: Any, name: str) -> None:
     hand.add_site(name=f"{name}/tool", pos=[g.HAND_M, 0, 0], group=SITE_GROUP)
     hand.add_site(name=f"{name}/nozzle", pos=list(g.NOZZLE_IN_HAND_M), group=SITE_GROUP)
     _limb(hand, f"{name}/hose", [0.02, 0, -0.018], list(g.NOZZLE_IN_HAND_M), 0.004)
-    hand.add_camera(name=f"{name}/eye", pos=list(g.CAMERA_IN_HAND_M), quat=[0.5, 0.5, -0.5, -0.5], fovy=48.0)
+    hand.add_camera(name=f"{name}/eye", pos=list(g.CAMERA_IN_HAND_M), quat=[0.5, 0.5, -0.5, -0.5], fovy=g.CAMERA_FOV_Y_DEG)
     hand.add_geom(name=f"{name}/bracket", type=BOX, size=[0.006, 0.012, 0.016], pos=[0.012, 0, 0.024], rgba=DARK, mass=0.0,
                   group=VISUAL_GROUP, **NOTHING)  # fmt: skip
     hand.add_geom(name=f"{name}/camera", type=BOX, size=[0.012, 0.018, 0.014], rgba=DARK, mass=0.0, group=VISUAL_GROUP,

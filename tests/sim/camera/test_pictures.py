@@ -1,14 +1,15 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
+from core.geometry.pinhole import directions, from_fov, look_at, project
 from core.scenario import find
 from sim.camera import hand, overview
-from sim.camera.camera import directions, from_fov, look_at, project
 from sim.camera.geoms import ASTROTURF, LEAF, SOIL, Geoms, Paint, geoms_of, paint_of
 from sim.camera.raster import rasterise
 from sim.camera.shade import Lamp, Light, cast_shadow, shade
@@ -39,7 +40,7 @@ def seen(xml: str) -> tuple[Geoms, Paint]:
 def test_the_whole_garden_is_seen_as_mujocos_rays_see_it(garden: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
     """One ray at a time: `mj_multiRay` culls by angle and misses leaves here that `mj_ray` hits."""
     model, data = garden
-    camera = from_fov(80, 60, 60.0)
+    camera = from_fov(80, 60, math.radians(60.0))
     T_world_cam = look_at(np.array([-1.2, 0.9, 0.5]), np.array([-0.5, 0.75, 0.55]), UP)
     ours = rasterise(camera, T_world_cam, geoms_of(model, data))
     groups, found = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8), np.zeros(1, dtype=np.int32)
@@ -79,7 +80,7 @@ def test_a_ball_casts_a_shadow_away_from_the_lamp() -> None:
     geoms, paint = seen(BALL_OVER_FLOOR)
     lamp = Lamp(pos_m=(-4.0, 0.0, 6.0), rgb=(0.8, 0.8, 0.8))
     light = Light(lamps=(lamp,))
-    camera, T_world_cam = from_fov(200, 200, 60.0), look_at(np.array([0.0, -0.01, 3.5]), np.zeros(3), UP)
+    camera, T_world_cam = from_fov(200, 200, math.radians(60.0)), look_at(np.array([0.0, -0.01, 3.5]), np.zeros(3), UP)
     raster = rasterise(camera, T_world_cam, geoms)
     shadow = cast_shadow(lamp, geoms, (0.0, 0.0, 0.0), 2.0)
     lit, shaded = (shade(camera, T_world_cam, raster, paint, light, s) for s in (None, shadow))
@@ -93,7 +94,7 @@ def test_a_ball_casts_a_shadow_away_from_the_lamp() -> None:
 def test_a_darker_exposure_darkens_and_a_red_ball_stays_red() -> None:
     geoms, paint = seen(BALL_OVER_FLOOR)
     light = Light(lamps=(Lamp(pos_m=(1.0, -1.0, 3.0), rgb=(0.8, 0.8, 0.8)),))
-    camera, T_world_cam = hand.camera(64, 48, 48.0), look_at(np.array([1.5, 0.0, 0.8]), np.array([0.0, 0.0, 0.6]), UP)
+    camera, T_world_cam = hand.camera(64, 48), look_at(np.array([1.5, 0.0, 0.8]), np.array([0.0, 0.0, 0.6]), UP)
     ball = rasterise(camera, T_world_cam, geoms).ids == 1
     bright = hand.draw(camera, T_world_cam, geoms, paint, light)[ball].mean(axis=0)
     dark = hand.draw(camera, T_world_cam, geoms, paint, replace(light, exposure=0.4))[ball].mean(axis=0)

@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 import pytest
 
-from sim.camera.camera import Camera, directions, from_fov, look_at, project
+from core.geometry.pinhole import Camera, directions, from_fov, look_at, project
 from sim.camera.geoms import geoms_of
 from sim.camera.raster import rasterise
 
@@ -54,7 +55,7 @@ def poses() -> Iterator[np.ndarray]:
 @pytest.mark.parametrize("T_world_cam", list(poses()))
 def test_the_raster_sees_what_mujocos_rays_see(seed: int, T_world_cam: np.ndarray) -> None:
     model, data = crowd(seed, 120)
-    camera = from_fov(160, 120, 58.0)
+    camera = from_fov(160, 120, math.radians(58.0))
     ours = rasterise(camera, T_world_cam, geoms_of(model, data))
     ids, distance_m, normal = cast(model, data, camera, T_world_cam)
     same = ours.ids == ids
@@ -73,7 +74,7 @@ def test_a_camera_inside_a_shape_sees_its_far_wall() -> None:
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    camera = from_fov(64, 48, 60.0)
+    camera = from_fov(64, 48, math.radians(60.0))
     T_world_cam = look_at(np.array([0.55, 0.0, 0.1]), np.array([0.0, 0.3, 0.0]), UP)
     ours = rasterise(camera, T_world_cam, geoms_of(model, data))
     ids, distance_m, _ = cast(model, data, camera, T_world_cam)
@@ -83,21 +84,21 @@ def test_a_camera_inside_a_shape_sees_its_far_wall() -> None:
 
 def test_nothing_behind_the_camera_is_drawn() -> None:
     model, data = crowd(1, 60)
-    camera = from_fov(32, 24, 50.0)
+    camera = from_fov(32, 24, math.radians(50.0))
     away = look_at(np.array([5.0, 0.0, 1.0]), np.array([9.0, 0.0, 1.4]), UP)
     assert (rasterise(camera, away, geoms_of(model, data)).ids == -1).all()
 
 
 def test_a_projected_point_lies_on_the_ray_of_its_pixel() -> None:
-    camera = from_fov(64, 48, 50.0)
+    camera = from_fov(64, 48, math.radians(50.0))
     T_world_cam = look_at(np.array([1.0, 2.0, 3.0]), np.zeros(3), UP)
     for v, u in ((0, 0), (47, 63), (20, 11)):
         p = T_world_cam[:3, 3] + 1.7 * T_world_cam[:3, :3] @ directions(camera)[v, u]
-        assert project(camera, T_world_cam, p[None])[0, :2] == pytest.approx((u, v))
+        assert project(camera, T_world_cam, p[None])[0, :2] == pytest.approx((u + 0.5, v + 0.5))
 
 
 def test_a_scaled_camera_sees_the_same_corners() -> None:
-    big = from_fov(640, 480, 50.0)
+    big = from_fov(640, 480, math.radians(50.0))
     small = big.scaled(320, 240)
-    edge = (np.array([-0.5, 639.5]) - big.cx) / big.fx
-    assert (np.array([-0.5, 319.5]) - small.cx) / small.fx == pytest.approx(edge)
+    edge = (np.array([0.0, 640.0]) - big.cx) / big.fx
+    assert (np.array([0.0, 320.0]) - small.cx) / small.fx == pytest.approx(edge)
