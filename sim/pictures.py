@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from core.clock import Clock
 from core.errors import NotFound
-from sim.camera.geoms import Floats, Geoms, Paint, geoms_of, paint_of
+from sim.camera.geoms import Geoms, Paint, geoms_of, paint_of, seen_by_hand
 from sim.wiring import Rig
 
 OVERVIEW_EVERY_S = 0.4
@@ -19,8 +18,6 @@ OVERVIEW_EVERY_S = 0.4
 OVERVIEW_COST_S = 0.4
 HAND_COST_S = 0.15
 HAND_SIZE = (640, 480)
-_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
-"""MuJoCo's cameras look along -z with y up."""
 
 
 class Pictures:
@@ -65,14 +62,10 @@ class Pictures:
         return job
 
     def _hand_job(self, robot_id: str, width: int, height: int) -> Callable[[], bytes]:
+        self._rig.clockwork.catch_up()
         model, data = self._rig.world.model, self._rig.world.data
-        geoms, paint = self._geoms(), self._paint
-        # The lens looks out of its own housing.
-        visible = geoms.visible.copy()
-        visible[model.geom(f"{robot_id}/camera").id] = False
-        geoms = replace(geoms, visible=visible)
-        eye = model.camera(f"{robot_id}/eye").id
-        T_world_cam = _pose(data.cam_xpos[eye], data.cam_xmat[eye].reshape(3, 3) @ _TO_OPENCV)
+        geoms, T_world_cam = seen_by_hand(model, data, robot_id)
+        paint = self._paint
         lamps_m, lamps_rgb = np.array(data.light_xpos), np.array(model.light_diffuse, dtype=np.float64)
 
         def job() -> bytes:
@@ -83,12 +76,6 @@ class Pictures:
             return overview.jpeg(hand.draw(camera, T_world_cam, geoms, paint, light))
 
         return job
-
-
-def _pose(p: Floats, R: Floats) -> Floats:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, p
-    return T
 
 
 def _facts(rig: Rig) -> list[dict[str, Any]]:

@@ -11,6 +11,8 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
 
+_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
+"""MuJoCo's cameras look along -z with y up."""
 VISIBLE_GROUPS = (0, 1, 2)
 """Geoms of other groups are collision hulls and helpers."""
 
@@ -72,6 +74,18 @@ def geoms_of(model: Any, data: Any, groups: tuple[int, ...] = VISIBLE_GROUPS) ->
         mat=np.array(data.geom_xmat, dtype=np.float64).reshape(-1, 9),
         visible=np.isin(model.geom_group, groups) & (alpha > 0.0),
     )
+
+
+def seen_by_hand(model: Any, data: Any, robot_id: str) -> tuple[Geoms, Floats]:
+    """What is before a robot's hand camera now: the geoms, and T_world_cam (4, 4)."""
+    geoms = geoms_of(model, data)
+    # The lens looks out of its own housing.
+    geoms.visible[model.geom(f"{robot_id}/camera").id] = False
+    eye = model.camera(f"{robot_id}/eye").id
+    T_world_cam = np.eye(4)
+    T_world_cam[:3, :3] = data.cam_xmat[eye].reshape(3, 3) @ _TO_OPENCV
+    T_world_cam[:3, 3] = data.cam_xpos[eye]
+    return geoms, T_world_cam
 
 
 def _material_alpha(model: Any) -> Floats:
