@@ -23,12 +23,16 @@ from core.errors import ConfigError
 from core.perception.detection import Box, Image
 
 LABELS = "labels.json"
+GROUPS = Path(__file__).with_name("groups.json")
+"""Groups of the development photographs, found once by `compared`."""
 VISIBLE_RATIO_MIN = 0.4
 """Rendered fruit hidden more than this allows are `difficult` (DESIGN, section 8)."""
 VALIDATION_SHARE = 0.3
 SPLIT_SEED = 7
-SAME_SCENE_INLIERS = 9
-"""So many points of two photographs moved alike say that they show the same plant; unrelated ones had at most 5."""
+SAME_SCENE_INLIERS = 8
+"""So many points of two photographs moved alike say that they show the same plant; unrelated ones had at most 6."""
+ALIKE_BITS = 40
+"""Descriptors (of 256 bits) that differ by fewer are taken for the same corner."""
 NEIGHBOURS = 3
 """Photographs of one folder whose numbers differ by no more are taken as one visit."""
 
@@ -140,7 +144,7 @@ def write(folder: Path, entries: Sequence[dict[str, Any]]) -> None:
 
 
 def split(photographs: Sequence[Photograph], seed: int = SPLIT_SEED, share: float = VALIDATION_SHARE) -> Split:
-    """Whole groups go to validation, drawn by `seed`, until each folder has given its share of images."""
+    """Whole groups go to validation, drawn by `seed`, as many as fit into each folder's share of images."""
     rng = np.random.default_rng(seed)
     train: list[Photograph] = []
     validation: list[Photograph] = []
@@ -150,7 +154,7 @@ def split(photographs: Sequence[Photograph], seed: int = SPLIT_SEED, share: floa
         wanted = round(share * len(mine))
         chosen: set[str] = set()
         for index in rng.permutation(len(groups)):
-            if sum(p.group in chosen for p in mine) < wanted:
+            if sum(p.group in chosen | {groups[int(index)]} for p in mine) <= wanted:
                 chosen.add(groups[int(index)])
         validation += [p for p in mine if p.group in chosen]
         train += [p for p in mine if p.group not in chosen]
@@ -161,8 +165,27 @@ def grouped(photographs: Sequence[Photograph]) -> tuple[Photograph, ...]:
     """The same photographs with groups: overlapping views of one scene, and neighbours in the order they were taken.
 
     Two photographs of a folder belong together when enough of their corners (ORB) moved alike, or when their numbers
-    differ by at most three. Takes about 0.1 ms a pair; photographs that came with a group keep together anyway.
+    differ by at most three. What `groups.json` knows already (by folder and file name) is not compared again: that takes
+    about a millisecond a pair. Photographs that came with a group keep together anyway.
     """
+    known = _known_groups()
+    names = [_name(p) for p in photographs]
+    if all(name in known for name in names):
+        return tuple(replace(p, group=known[name]) for p, name in zip(photographs, names, strict=True))
+    return compared(photographs)
+
+
+def _known_groups() -> dict[str, str]:
+    known: dict[str, str] = json.loads(GROUPS.read_text())
+    return known
+
+
+def _name(photograph: Photograph) -> str:
+    return f"{photograph.path.parent.parent.name}/{photograph.path.name}"
+
+
+def compared(photographs: Sequence[Photograph]) -> tuple[Photograph, ...]:
+    """The photographs with groups, found by comparing each with each."""
     parent = list(range(len(photographs)))
 
     def root(k: int) -> int:
@@ -189,7 +212,9 @@ def _corners(image: Image) -> tuple[Array, Array | None]:
     """Corners (N, 2) [px at 480 px] and their descriptors (N, 32)."""
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     scale = 480 / max(grey.shape)
-    points, described = cv2.ORB.create(300).detectAndCompute(cv2.resize(grey, None, fx=scale, fy=scale), None)
+    points, described = cv2.ORB.create(300).detectAndCompute(
+        cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), None
+    )
     return np.array([p.pt for p in points], np.float32).reshape(-1, 2), described
 
 
@@ -197,8 +222,8 @@ def _overlap(one: tuple[Array, Array | None], other: tuple[Array, Array | None])
     """Whether enough corners agree on one shift, turn and scale between half and double."""
     if one[1] is None or other[1] is None:
         return False
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(one[1], other[1])
-    near = [pair for pair in pairs if pair.distance < 48]
+    pairs = sorted(cv2.BFMatcher(cv2.NORM_HAMMING).match(one[1], other[1]), key=lambda pair: -pair.distance)
+    near = list({pair.trainIdx: pair for pair in pairs if pair.distance < ALIKE_BITS}.values())
     if len(near) < SAME_SCENE_INLIERS:
         return False
     source, target = one[0][[p.queryIdx for p in near]], other[0][[p.trainIdx for p in near]]
