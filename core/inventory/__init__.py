@@ -1,0 +1,1 @@
+"""What a robot sees of a plant's fruit, and what the plant makes of it."""

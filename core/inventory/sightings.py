@@ -1,0 +1,307 @@
+"""From the circles of several pictures to fruit in space: the robot's half of an inventory (paper 000, section 5).
+
+Two ways of lifting: by a fixed radius, as the paper does, from one picture; and by triangulating bearings from all poses,
+which needs no assumption about the size and is better by far. Everything in the frame that the camera poses are given in
+(the plant's, as a rule) [m]; pictures in pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.geometry.pinhole import Camera
+from core.manipulation.servo import FRUIT_RADIUS_M, Target
+from core.perception.detection import Detection
+
+Array = NDArray[np.float64]
+
+RADIUS_PRIOR_SIGMA_M = 0.003
+"""How fruit differ in size."""
+BEARING_SIGMA_PX = 1.5
+BEARING_SIGMA_RATIO = 0.08
+"""Part of the circle's radius by which its centre is off: leaves cut pieces off a fruit."""
+SIZE_SIGMA_RATIO = 0.15
+GATE_CHI2 = 14.0
+SAME_FRUIT_M = 0.012
+"""Two tracks nearer than this are one fruit: no two ripe fruit share so much room."""
+MEET_M = 0.02
+"""Rays of one fruit pass each other nearer than this."""
+RADII_M = (0.006, 0.024)
+ROUNDS, ROUNDS_PLAIN = 12, 4
+"""Of Gauss-Newton: the first find the neighbourhood, in the rest an outlier loses its weight."""
+COLOURS = ("green", "turning", "red")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """One pose of the scan and what was detected from it."""
+
+    T_plant_cam: Array
+    detections: tuple[Detection, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seen:
+    """One fruit as a scan has it."""
+
+    p: Array
+    """(3,) [m]."""
+    sigma_m: float
+    radius_m: float
+    colour: str
+    confidence: float
+    views: tuple[int, ...]
+    """Indices of the views that saw it."""
+    best_view: int
+    image_x_px: float
+    image_y_px: float
+
+
+@dataclass(slots=True)
+class _Track:
+    target: Target
+    hits: dict[int, Detection] = field(default_factory=dict)
+
+
+def lift_fixed_radius(camera: Camera, T_plant_cam: Array, seen: Detection, radius_m: float = FRUIT_RADIUS_M) -> Array:
+    """The paper's depth: (3,) [m], where a ball of `radius_m` would look this large."""
+    z_m = camera.fx * radius_m / max(seen.radius_px, 1e-6)
+    p_cam = np.array([(seen.u_px - camera.cx) / camera.fx * z_m, (seen.v_px - camera.cy) / camera.fy * z_m, z_m])
+    lifted: Array = T_plant_cam[:3, :3] @ p_cam + T_plant_cam[:3, 3]
+    return lifted
+
+
+def triangulate(
+    camera: Camera, poses: Sequence[Array], circles: Sequence[Detection], start: Array, radius_m: float = FRUIT_RADIUS_M
+) -> tuple[Array, Array, float]:
+    """Position (3,), covariance (3, 3) [m] and radius [m] of one ball seen as `circles` from `poses` (T_plant_cam).
+
+    Gauss-Newton on bearings and apparent sizes, the radius being an unknown with a prior round `radius_m`: one view gives
+    the paper's depth, several give a triangulated one.
+    """
+    x = np.array([*start, radius_m])
+    prior = np.diag([1e-6, 1e-6, 1e-6, RADIUS_PRIOR_SIGMA_M**-2])
+    information = prior
+    for number in range(ROUNDS):
+        information, pull = prior.copy(), prior @ (np.array([*x[:3], radius_m]) - x)
+        for T, circle in zip(poses, circles, strict=True):
+            J, gap, weights = _residual(camera, T, circle, x, robust=number >= ROUNDS_PLAIN)
+            information += J.T @ (weights[:, None] * J)
+            pull += J.T @ (weights * gap)
+        step = np.linalg.solve(information, pull)
+        x = x + step
+        x[3] = min(max(x[3], 0.5 * radius_m), 2.0 * radius_m)
+        if number > ROUNDS_PLAIN and float(np.abs(step).max()) < 1e-5:
+            break
+    covariance = np.linalg.inv(information)
+    return x[:3], covariance[:3, :3], float(x[3])
+
+
+def _residual(camera: Camera, T: Array, circle: Detection, x: Array, *, robust: bool) -> tuple[Array, Array, Array]:
+    """Jacobian (3, 4), gap (3,) and weights (3,) of one circle."""
+    R = T[:3, :3]
+    p = R.T @ (x[:3] - T[:3, 3])
+    z = max(float(p[2]), 0.02)
+    fx, fy = camera.fx, camera.fy
+    expected = np.array([fx * p[0] / z + camera.cx, fy * p[1] / z + camera.cy, fx * x[3] / z])
+    d = np.array([[fx / z, 0, -fx * p[0] / z**2], [0, fy / z, -fy * p[1] / z**2], [0, 0, -fx * x[3] / z**2]])
+    J = np.zeros((3, 4))
+    J[:, :3] = d @ R.T
+    J[2, 3] = fx / z
+    side = BEARING_SIGMA_PX + BEARING_SIGMA_RATIO * circle.radius_px
+    size = 1.0 + SIZE_SIGMA_RATIO * circle.radius_px
+    gap = np.array([circle.u_px, circle.v_px, circle.radius_px]) - expected
+    sigmas = np.array([side, side, size])
+    weights = sigmas**-2
+    if robust:
+        # Cauchy's weight: one wrong circle must not drag the fruit along.
+        weights = weights / (1.0 + (gap / (3.0 * sigmas)) ** 2)
+    return J, gap, weights
+
+
+def fuse(camera: Camera, views: Sequence[View], radius_m: float = FRUIT_RADIUS_M) -> list[Seen]:
+    """The fruit of a whole scan, each once.
+
+    Every pair of circles from two views whose rays meet proposes a point; the point that most views support takes its
+    circles, then the next. What no other view supports stays alone, at the paper's depth.
+    """
+    circles = [(index, circle) for index, view in enumerate(views) for circle in view.detections]
+    if not circles:
+        return []
+    tracks = _supported(camera, views, circles, radius_m)
+    for track in tracks:
+        _settle(camera, views, track, radius_m)
+    owned = {id(circle) for track in tracks for circle in track.hits.values()}
+    for index, circle in circles:
+        if id(circle) not in owned and not _explained(camera, views, index, circle, tracks):
+            tracks.append(_born(camera, index, views[index], circle, radius_m))
+    return [_seen(track) for track in _merged(tracks)]
+
+
+def _supported(
+    camera: Camera, views: Sequence[View], circles: Sequence[tuple[int, Detection]], radius_m: float
+) -> list[_Track]:
+    """Tracks of two views or more, the best supported first."""
+    points, radii = _proposals(camera, views, circles)
+    if len(points) == 0:
+        return []
+    support = _support(camera, views, circles, points, radii)
+    starts = np.flatnonzero(np.diff([-1, *(index for index, _ in circles)]))
+    tracks: list[_Track] = []
+    while True:
+        by_view = np.maximum.reduceat(support, starts, axis=1)
+        total = by_view.sum(axis=1)
+        best = int(total.argmax())
+        if np.count_nonzero(by_view[best] > 0.0) < 2:
+            return tracks
+        ends = [*starts[1:], len(circles)]
+        mine = [
+            int(first + support[best, first:end].argmax())
+            for first, end in zip(starts, ends, strict=True)
+            if support[best, first:end].max() > 0.0
+        ]
+        hits = {circles[column][0]: circles[column][1] for column in mine}
+        target = Target(p_base=points[best], P=np.eye(3) * 0.01**2, radius_m=float(np.clip(radii[best], *RADII_M)))
+        tracks.append(_Track(target, hits))
+        support[:, mine] = 0.0
+
+
+def _proposals(camera: Camera, views: Sequence[View], circles: Sequence[tuple[int, Detection]]) -> tuple[Array, Array]:
+    """Where the rays of two circles from different views meet: points (N, 3) and the radius (N,) [m] they imply."""
+    eyes = np.array([views[index].T_plant_cam[:3, 3] for index, _ in circles])
+    rays = np.array([_ray(camera, views[index].T_plant_cam, circle) for index, circle in circles])
+    angles = np.array([circle.radius_px / camera.fx for _, circle in circles])
+    view_of = np.array([index for index, _ in circles])
+    colour_of = np.array([COLOURS.index(circle.colour) for _, circle in circles])
+    a, b = np.triu_indices(len(circles), 1)
+    keep = (view_of[a] != view_of[b]) & (np.abs(colour_of[a] - colour_of[b]) < 2)
+    a, b = a[keep], b[keep]
+    # The nearest points of two lines, p = eye + t ray, with t counted along the optical axis (rays have depth 1).
+    w = eyes[a] - eyes[b]
+    aa, bb, ab = (rays[a] ** 2).sum(1), (rays[b] ** 2).sum(1), (rays[a] * rays[b]).sum(1)
+    aw, bw = (rays[a] * w).sum(1), (rays[b] * w).sum(1)
+    lean = np.maximum(aa * bb - ab**2, 1e-9)
+    ta, tb = (ab * bw - bb * aw) / lean, (aa * bw - ab * aw) / lean
+    pa, pb = eyes[a] + ta[:, None] * rays[a], eyes[b] + tb[:, None] * rays[b]
+    ra, rb = ta * angles[a], tb * angles[b]
+    radii = np.sqrt(np.maximum(ra * rb, 1e-12))
+    near = (ta > 0.05) & (tb > 0.05) & (np.linalg.norm(pa - pb, axis=1) < MEET_M)
+    fits = (radii > RADII_M[0]) & (radii < RADII_M[1]) & (np.abs(np.log(np.maximum(ra, 1e-6) / np.maximum(rb, 1e-6))) < 0.6)
+    good = near & fits
+    return (0.5 * (pa + pb))[good], radii[good]
+
+
+def _ray(camera: Camera, T: Array, circle: Detection) -> Array:
+    """Direction (3,) with depth 1 along the optical axis."""
+    ahead = np.array([(circle.u_px - camera.cx) / camera.fx, (circle.v_px - camera.cy) / camera.fy, 1.0])
+    turned: Array = T[:3, :3] @ ahead
+    return turned
+
+
+def _support(
+    camera: Camera, views: Sequence[View], circles: Sequence[tuple[int, Detection]], points: Array, radii: Array
+) -> Array:
+    """How well each circle agrees with each point: (N, M), 0 beyond the gate, more the better."""
+    support = np.zeros((len(points), len(circles)))
+    for column, (index, circle) in enumerate(circles):
+        T = views[index].T_plant_cam
+        p = (points - T[:3, 3]) @ T[:3, :3]
+        z = np.maximum(p[:, 2], 0.02)
+        side = BEARING_SIGMA_PX + BEARING_SIGMA_RATIO * circle.radius_px
+        du = (camera.fx * p[:, 0] / z + camera.cx - circle.u_px) / side
+        dv = (camera.fy * p[:, 1] / z + camera.cy - circle.v_px) / side
+        dr = np.log(np.maximum(camera.fx * radii / z, 1e-6) / circle.radius_px) / (1.5 * SIZE_SIGMA_RATIO)
+        support[:, column] = np.maximum(0.0, 1.0 - (du**2 + dv**2 + dr**2) / GATE_CHI2)
+    return support
+
+
+def _explained(camera: Camera, views: Sequence[View], index: int, circle: Detection, tracks: Sequence[_Track]) -> bool:
+    """A circle of a known fruit, cut short or shifted by a leaf: near it in the picture, and no other circle is its own."""
+    for track in tracks:
+        own = track.hits.get(index)
+        if own is not None and not _overlap(own, circle):
+            continue
+        z = _expected(track.target, camera, views[index].T_plant_cam)
+        if z is None or circle.radius_px > 1.6 * z[2] or not _may_be_one(track, circle):
+            continue
+        if np.hypot(z[0] - circle.u_px, z[1] - circle.v_px) < 0.8 * max(z[2], circle.radius_px):
+            return True
+    return False
+
+
+def _expected(target: Target, camera: Camera, T: Array) -> Array | None:
+    p = (target.p_base - T[:3, 3]) @ T[:3, :3]
+    return target.features(camera, T) if p[2] > 0.03 else None
+
+
+def _overlap(a: Detection, b: Detection) -> bool:
+    """Two circles of one picture that share most of their area: the detector saw one fruit twice."""
+    return float(np.hypot(a.u_px - b.u_px, a.v_px - b.v_px)) < 0.7 * max(a.radius_px, b.radius_px)
+
+
+def _born(camera: Camera, index: int, view: View, circle: Detection, radius_m: float) -> _Track:
+    p = lift_fixed_radius(camera, view.T_plant_cam, circle, radius_m)
+    away = p - view.T_plant_cam[:3, 3]
+    range_m = float(np.linalg.norm(away))
+    ray = away / range_m
+    across_m = (BEARING_SIGMA_PX + BEARING_SIGMA_RATIO * circle.radius_px) * range_m / camera.fx
+    along_m = range_m * 0.25
+    P = across_m**2 * (np.eye(3) - np.outer(ray, ray)) + along_m**2 * np.outer(ray, ray)
+    return _Track(Target(p_base=p, P=P, radius_m=radius_m), {index: circle})
+
+
+def _may_be_one(track: _Track, circle: Detection) -> bool:
+    """Green and red are never one fruit within one scan; turning goes with both."""
+    colours = {hit.colour for hit in track.hits.values()} | {circle.colour}
+    return not {"green", "red"} <= colours
+
+
+def _settle(camera: Camera, views: Sequence[View], track: _Track, radius_m: float) -> None:
+    poses = [views[index].T_plant_cam for index in track.hits]
+    start = track.target.p_base
+    p, P, radius = triangulate(camera, poses, list(track.hits.values()), start, radius_m)
+    track.target = Target(p_base=p, P=P, radius_m=radius)
+
+
+def _merged(tracks: list[_Track]) -> list[_Track]:
+    """Join tracks that stand in one place, unless some picture shows them side by side."""
+    kept: list[_Track] = []
+    for track in sorted(tracks, key=lambda t: (-len(t.hits), t.target.sigma_m)):
+        twin = next((other for other in kept if _twins(other, track)), None)
+        if twin is None:
+            kept.append(track)
+        else:
+            twin.hits = track.hits | twin.hits
+    return kept
+
+
+def _twins(a: _Track, b: _Track) -> bool:
+    gap = a.target.p_base - b.target.p_base
+    both = set(a.hits) & set(b.hits)
+    if any(not _overlap(a.hits[view], b.hits[view]) for view in both):
+        return False
+    if {"green", "red"} <= {hit.colour for hit in (*a.hits.values(), *b.hits.values())}:
+        return False
+    spread = a.target.P + b.target.P + np.eye(3) * (SAME_FRUIT_M / 3) ** 2
+    return float(gap @ np.linalg.solve(spread, gap)) < 9.0 and float(np.linalg.norm(gap)) < 0.04
+
+
+def _seen(track: _Track) -> Seen:
+    votes = {colour: sum(h.confidence for h in track.hits.values() if h.colour == colour) for colour in COLOURS}
+    missed = float(np.prod([1.0 - 0.95 * min(hit.confidence, 1.0) for hit in track.hits.values()]))
+    best = max(track.hits, key=lambda view: (track.hits[view].confidence, -view))
+    return Seen(
+        p=track.target.p_base,
+        sigma_m=track.target.sigma_m,
+        radius_m=track.target.radius_m,
+        colour=max(COLOURS, key=lambda colour: votes[colour]),
+        confidence=1.0 - missed,
+        views=tuple(sorted(track.hits)),
+        best_view=best,
+        image_x_px=track.hits[best].u_px,
+        image_y_px=track.hits[best].v_px,
+    )

@@ -1,0 +1,146 @@
+"""How to come at a fruit: the pitch of the hand, the joints on the way in and out, and the room left to its neighbours.
+
+Everything in the base frame of a docked robot [m]. The hand comes along its own x axis, straight at the fruit, and goes
+back the same way, so that what was not touched coming in is not touched going out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from core.errors import Refused
+from core.manipulation.arm import Joints, Point3, inverse
+from core.manipulation.eye import singular
+from core.manipulation.swing import obstruction
+from core.robots.gardener import GRIPPER_OPEN_M, HAND_M, SHOULDER_X_M
+
+LOOK_M = 0.12
+"""Tool point short of the fruit while the servo looks: from nearer the eye, which sits above the fingers, loses it."""
+READY_M = 0.05
+"""Tool point short of the fruit before the last, straight advance."""
+RETREAT_M = 0.09
+"""Straight back with the fruit, until nothing hangs between the fingers and the plant."""
+STEP_M = 0.015
+OPENING_SLACK_M = 0.009
+"""The fingers open this much wider than the fruit on either side: room for error, none for its neighbour."""
+PITCHES_RAD = tuple(math.radians(d) for d in (0, 10, -10, 20, -20, 30, -30, 40, -40, 50, -50, 60))
+FINGER_M = 0.010
+"""Thickness of a finger outside the opening."""
+FINGER_HALF_HEIGHT_M = 0.014
+FINGER_TIP_M = 0.016
+"""The pads reach this far beyond the tool point."""
+CAMERA_BOTTOM_M, CAMERA_TOP_M, CAMERA_HALF_WIDTH_M = 0.028, 0.062, 0.020
+ROOM_ENOUGH_M = 0.012
+"""More room than this to a neighbour is worth nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Obstacle:
+    """A fruit that is not wanted now."""
+
+    centre: Point3
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Approach:
+    """One way to a fruit. `path` runs from the looking pose to the grasp; going back is the same in reverse."""
+
+    pitch_rad: float
+    opening_m: float
+    path: tuple[Joints, ...]
+    room_m: float
+    """Between the hand and the nearest neighbour; negative when it would be pushed."""
+
+    @property
+    def look(self) -> Joints:
+        return self.path[0]
+
+    @property
+    def grasp(self) -> Joints:
+        return self.path[-1]
+
+
+def opening_for(radius_m: float) -> float:
+    """How wide to open for a fruit of this radius [m]."""
+    return min(GRIPPER_OPEN_M, 2 * (radius_m + OPENING_SLACK_M))
+
+
+def along(fruit: Point3, pitch_rad: float, short_m: float) -> Point3:
+    """The point `short_m` before the fruit on the hand's way to it."""
+    bearing = math.atan2(fruit[1], fruit[0] - SHOULDER_X_M)
+    cos = math.cos(pitch_rad)
+    return (
+        fruit[0] - short_m * cos * math.cos(bearing),
+        fruit[1] - short_m * cos * math.sin(bearing),
+        fruit[2] - short_m * math.sin(pitch_rad),
+    )
+
+
+def way_in(fruit: Point3, pitch_rad: float, from_m: float = LOOK_M, to_m: float = 0.0) -> tuple[Joints, ...]:
+    """Joints every `STEP_M` from `from_m` before the fruit to `to_m`; raises Refused where one cannot be or touches."""
+    count = max(1, math.ceil(abs(from_m - to_m) / STEP_M))
+    path = []
+    for index in range(count + 1):
+        q = inverse(along(fruit, pitch_rad, from_m + (to_m - from_m) * index / count), pitch_rad)
+        if why := singular(q) or obstruction(q):
+            raise Refused(why, hint="try another pitch")
+        path.append(q)
+    return tuple(path)
+
+
+def room_m(fruit: Point3, pitch_rad: float, opening_m: float, others: Sequence[Obstacle]) -> float:
+    """The least distance between the hand, anywhere on its way in, and another fruit's skin [m]."""
+    bearing = math.atan2(fruit[1], fruit[0] - SHOULDER_X_M)
+    least = math.inf
+    for other in others:
+        x, y, z = _in_hand(fruit, bearing, pitch_rad, other.centre)
+        if x > FINGER_TIP_M + other.radius_m or x < -LOOK_M - HAND_M:
+            continue
+        fingers = _off(abs(y) - opening_m / 2 - FINGER_M, abs(z) - FINGER_HALF_HEIGHT_M)
+        housing_z = abs(z - (CAMERA_BOTTOM_M + CAMERA_TOP_M) / 2) - (CAMERA_TOP_M - CAMERA_BOTTOM_M) / 2
+        housing = _off(abs(y) - CAMERA_HALF_WIDTH_M, housing_z) if x < -0.10 else math.inf
+        least = min(least, min(fingers, housing) - other.radius_m)
+    return least
+
+
+def approaches(fruit: Point3, radius_m: float, others: Sequence[Obstacle]) -> list[Approach]:
+    """Every way that the arm can go, the best first: most room to the neighbours, then the least pitch.
+
+    Raises Refused with the reason of the pitch that came nearest to working when there is none.
+    """
+    opening_m = opening_for(radius_m)
+    found: list[Approach] = []
+    why: Refused | None = None
+    for pitch_rad in PITCHES_RAD:
+        try:
+            path = way_in(fruit, pitch_rad)
+        except Refused as refusal:
+            why = why or refusal
+            continue
+        room = room_m(fruit, pitch_rad, opening_m, others)
+        found.append(Approach(pitch_rad=pitch_rad, opening_m=opening_m, path=path, room_m=room))
+    if not found:
+        raise Refused(f"no way of the hand to the fruit: {why}", hint="another dock or robot may reach it")
+    return sorted(found, key=lambda a: (-min(a.room_m, ROOM_ENOUGH_M), abs(a.pitch_rad)))
+
+
+def travel_rad(path: Sequence[Joints]) -> float:
+    """The largest joint travel summed along a path [rad]: what its duration follows from."""
+    return sum(max(abs(b - a) for a, b in zip(p, q, strict=True)) for p, q in pairwise(path))
+
+
+def _in_hand(fruit: Point3, bearing: float, pitch_rad: float, p: Point3) -> Point3:
+    """A point in the frame of a hand whose tool is at the fruit: x on, y left, z the hand's upper side."""
+    dx, dy, dz = p[0] - fruit[0], p[1] - fruit[1], p[2] - fruit[2]
+    r, y = dx * math.cos(bearing) + dy * math.sin(bearing), -dx * math.sin(bearing) + dy * math.cos(bearing)
+    cos, sin = math.cos(pitch_rad), math.sin(pitch_rad)
+    return r * cos + dz * sin, y, -r * sin + dz * cos
+
+
+def _off(dy: float, dz: float) -> float:
+    """Distance from a rectangle of a point that lies `dy` and `dz` outside its sides; negative inside."""
+    return max(dy, dz) if dy <= 0 and dz <= 0 else math.hypot(max(dy, 0.0), max(dz, 0.0))

@@ -1,0 +1,93 @@
+"""The eye in the hand: where the camera is for given joints, where it should be, and the six poses of a scan.
+
+Camera frame: z forward through the picture, x right, y down (OpenCV's). Base frame as in `core.robots.gardener`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from core.errors import Refused
+from core.manipulation.arm import Joints, Point3, inverse
+from core.manipulation.kinematics import Array, forward
+from core.manipulation.swing import obstruction
+from core.robots.gardener import CAMERA_IN_HAND_M, DOCK_TO_STEM_M, SHOULDER_X_M
+
+T_HAND_CAM: Array = np.array(
+    [
+        [0.0, 0.0, 1.0, CAMERA_IN_HAND_M[0]],
+        [-1.0, 0.0, 0.0, CAMERA_IN_HAND_M[1]],
+        [0.0, -1.0, 0.0, CAMERA_IN_HAND_M[2]],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""The camera looks along the hand; the top of its picture is the hand's upper side."""
+
+SCAN_PANS_RAD = (math.radians(17.0), math.radians(-17.0))
+SCAN_HEIGHTS_M = (0.38, 0.56, 0.74)
+"""Of the camera above the floor."""
+SCAN_LOOKS_AT_M = (0.52, 0.58, 0.66)
+"""Height of the point on the stem's axis that each of them looks at: the pictures overlap, so that fruit are triangulated."""
+SCAN_STAND_OFF_M = 0.42
+"""From the camera to the stem, seen from above: as far back as the arm can fold."""
+
+
+def camera_pose(q: Joints) -> Array:
+    """T_base_cam (4, 4) [m] for these joints."""
+    pose: Array = forward(q) @ T_HAND_CAM
+    return pose
+
+
+def looking(camera_base_m: Point3, pitch_rad: float) -> Joints:
+    """Joints that put the camera's centre at a point of the base frame [m], looking along this pitch.
+
+    The camera always looks away from the pan axis: a 4-DOF arm has no choice of azimuth. Raises Refused.
+    """
+    return inverse(camera_base_m, pitch_rad, CAMERA_IN_HAND_M)
+
+
+def scan_poses(stem_base_m: Point3 = (DOCK_TO_STEM_M, 0.0, 0.0)) -> tuple[Joints, ...]:
+    """The six camera poses of an inventory (paper 000, section 5): two bearings by three heights, in a snake.
+
+    A height that the arm cannot reach at the wanted stand-off is taken a little further from or nearer to the plant.
+    """
+    poses: list[Joints] = []
+    bearing_rad = math.atan2(stem_base_m[1], stem_base_m[0] - SHOULDER_X_M)
+    for row, (z_m, aim_z_m) in enumerate(zip(SCAN_HEIGHTS_M, SCAN_LOOKS_AT_M, strict=True)):
+        pans = SCAN_PANS_RAD if row % 2 == 0 else SCAN_PANS_RAD[::-1]
+        poses += [_nearest_pose(stem_base_m, bearing_rad + pan, z_m, aim_z_m) for pan in pans]
+    return tuple(poses)
+
+
+def _nearest_pose(stem_base_m: Point3, pan_rad: float, z_m: float, aim_z_m: float) -> Joints:
+    away_m = math.hypot(stem_base_m[0] - SHOULDER_X_M, stem_base_m[1])
+    first: Refused | None = None
+    for shift_m in (0.0, 0.03, -0.03, 0.06, -0.06, 0.10, -0.10, 0.14):
+        r_m = away_m - SCAN_STAND_OFF_M + shift_m
+        pitch_rad = math.atan2(aim_z_m - z_m, away_m - r_m)
+        point = (SHOULDER_X_M + r_m * math.cos(pan_rad), r_m * math.sin(pan_rad), z_m)
+        try:
+            q = looking(point, pitch_rad)
+        except Refused as refusal:
+            first = first or refusal
+            continue
+        if not (why := obstruction(q)):
+            return q
+        first = first or Refused(why, hint="dock again")
+    assert first is not None
+    raise first
+
+
+def singular(q: Joints, sine_min: float = 0.08) -> str:
+    """Why the arm cannot move freely at these joints; empty when it can.
+
+    Singular where the elbow is straight or folded shut, and where the wrist stands over the pan axis.
+    """
+    if abs(math.sin(q[2])) < sine_min:
+        return "the elbow is almost straight: the arm is at the end of its reach"
+    hand = forward(q)
+    if math.hypot(hand[0, 3] - SHOULDER_X_M, hand[1, 3]) < 0.02:
+        return "the wrist stands over the pan axis"
+    return ""

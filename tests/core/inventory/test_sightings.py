@@ -1,0 +1,104 @@
+"""Circles of six pictures become fruit: each once, where it is, however large, with clutter and gaps."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from core.geometry.pinhole import from_fov
+from core.inventory.sightings import View, fuse, lift_fixed_radius, triangulate
+from core.manipulation.eye import camera_pose, scan_poses
+from core.manipulation.servo import Target
+from core.perception.detection import Detection
+from core.robots.gardener import CAMERA_FOV_Y_DEG
+
+CAMERA = from_fov(640, 480, math.radians(CAMERA_FOV_Y_DEG))
+POSES = [camera_pose(q) for q in scan_poses()]
+
+
+def circle(p: np.ndarray, radius_m: float, T: np.ndarray, colour: Literal["green", "turning", "red"]) -> Detection | None:
+    ahead = T[:3, :3].T @ (p - T[:3, 3])
+    if ahead[2] < 0.08:
+        return None
+    u, v, r = Target(p_base=p, P=np.eye(3), radius_m=radius_m).features(CAMERA, T)
+    inside = r < u < CAMERA.width - r and r < v < CAMERA.height - r
+    return Detection(u_px=u, v_px=v, radius_px=r, colour=colour, confidence=0.8) if inside else None
+
+
+def noisy(c: Detection, rng: np.random.Generator) -> Detection:
+    return Detection(
+        u_px=c.u_px + rng.normal(0, 1.5),
+        v_px=c.v_px + rng.normal(0, 1.5),
+        radius_px=c.radius_px * (1 + rng.normal(0, 0.06)),
+        colour=c.colour,
+        confidence=c.confidence,
+    )
+
+
+def garden(rng: np.random.Generator) -> list[tuple[np.ndarray, float, Literal["green", "red"]]]:
+    """Two dozen fruit on four trusses."""
+    fruit: list[tuple[np.ndarray, float, Literal["green", "red"]]] = []
+    for truss in range(4):
+        root = np.array([0.47, rng.uniform(-0.10, 0.10), 0.40 + 0.10 * truss])
+        for nth in range(6):
+            p = root + np.array([-0.012 * nth, 0.018 * (-1) ** nth, -0.02 * nth]) + rng.normal(0, 0.002, 3)
+            fruit.append((p, float(rng.uniform(0.011, 0.016)), "red" if truss < 2 else "green"))
+    return fruit
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_fruit_seen_from_two_poses_are_found_once_within_a_centimetre(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    fruit = garden(rng)
+    views: list[View] = []
+    times = [0] * len(fruit)
+    for T in POSES:
+        found = []
+        for index, (p, radius_m, colour) in enumerate(fruit):
+            c = circle(p, radius_m, T, colour)
+            if c is not None and rng.uniform() < 0.8:
+                found.append(noisy(c, rng))
+                times[index] += 1
+        views.append(View(T_plant_cam=T, detections=tuple(found)))
+    visible = [index for index, count in enumerate(times) if count > 1]
+    seen = [s for s in fuse(CAMERA, views) if len(s.views) > 1]
+    truth = np.array([p for p, _, _ in fruit])
+    gaps = np.array([np.linalg.norm(truth - s.p, axis=1) for s in seen])
+    nearest = gaps.argmin(axis=1)
+    near = gaps.min(axis=1) < 0.01
+    recall = len(set(nearest[near]) & set(visible)) / len(visible)
+    precision = len(set(nearest[near])) / len(seen)
+    print(f"seed {seed}: {len(visible)} visible, {len(seen)} said, recall {recall:.2f}, precision {precision:.2f}")
+    assert recall >= 0.9
+    assert precision >= 0.9
+    assert float(np.median(gaps.min(axis=1))) < 0.005
+    assert all(s.colour == fruit[n][2] for s, n in zip(seen, nearest, strict=True))
+
+
+def test_triangulation_beats_the_fixed_radius_for_a_large_fruit() -> None:
+    p, radius_m = np.array([0.44, 0.03, 0.55]), 0.0165
+    views = [(T, c) for T in POSES if (c := circle(p, radius_m, T, "red")) is not None]
+    single = lift_fixed_radius(CAMERA, *views[0])
+    found, covariance, radius = triangulate(CAMERA, [T for T, _ in views], [c for _, c in views], single)
+    assert float(np.linalg.norm(single - p)) > 0.03
+    assert float(np.linalg.norm(found - p)) < 0.003
+    assert radius == pytest.approx(radius_m, abs=0.0005)
+    assert 0 < math.sqrt(np.trace(covariance)) < 0.02
+
+
+def test_a_circle_that_only_one_picture_shows_stays_a_doubtful_fruit_at_the_paper_s_depth() -> None:
+    stray = Detection(u_px=320, v_px=240, radius_px=20, colour="red", confidence=0.4)
+    views = [View(T_plant_cam=T, detections=(stray,) if n == 0 else ()) for n, T in enumerate(POSES)]
+    (only,) = fuse(CAMERA, views)
+    assert only.views == (0,)
+    assert only.confidence < 0.5
+    assert only.sigma_m > 0.03
+    np.testing.assert_allclose(only.p, lift_fixed_radius(CAMERA, POSES[0], stray), atol=1e-3)
+
+
+def test_nothing_seen_is_no_fruit() -> None:
+    assert fuse(CAMERA, [View(T_plant_cam=T, detections=()) for T in POSES]) == []
+    assert fuse(CAMERA, []) == []
