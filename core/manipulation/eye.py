@@ -29,7 +29,7 @@ SCAN_PANS_RAD = (math.radians(17.0), math.radians(-17.0))
 SCAN_HEIGHTS_M = (0.38, 0.56, 0.74)
 """Of the camera above the floor."""
 SCAN_LOOKS_AT_M = (0.52, 0.58, 0.66)
-"""Height of the point on the stem's axis that each of them looks at: the pictures overlap, so that fruit are triangulated."""
+"""Height of the point on the stem's axis that each of them looks at: pictures overlap, so that fruit are triangulated."""
 SCAN_STAND_OFF_M = 0.42
 """From the camera to the stem, seen from above: as far back as the arm can fold."""
 

@@ -107,12 +107,15 @@ CAMERA_IN_HAND_M = (0.03, 0.0, 0.045)
 """Camera centre from the wrist axis along (hand x, y, z); it looks along hand x, its picture's top is hand z."""
 CAMERA_PIXELS = (640, 480)
 """Its largest picture, width and height; it can give half of that."""
-CAMERA_FOV_Y_DEG = 48.0
-"""From the picture's top to its bottom."""
+CAMERA_FOV_Y_DEG = 64.0
+"""From the picture's top to its bottom: a wide lens, so that poses a hand's breadth apart see the same fruit, and the eye
+still sees what the fingers hold."""
 NOZZLE_IN_HAND_M = (0.11, 0.0, -0.02)
 
 ARM_HOME_RAD = (0.0, math.radians(150.0), math.radians(-150.0), math.radians(60.0))
 """Folded over the body: within the footprint while driving."""
+ARM_BASKET_RAD = (0.0, math.radians(165.0), math.radians(-80.0), math.radians(-81.0))
+"""The tool over the basket, hand level and pointing forward: opening the gripper drops the fruit 0.33 m into it."""
 
 
 def gripper_opening_m(servo_rad: float) -> float:
