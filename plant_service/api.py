@@ -14,6 +14,7 @@ from core.history import as_csv
 from core.mesh.auth import Caller
 from core.mesh.chassis import allow, body, serve_ready
 from core.wire.documents import HistoryEntry
+from core.wire.fruit import Colour, Fruit, Inventory, NewFruit, Scan
 from core.wire.market import (
     Permit,
     PermitRequest,
@@ -25,13 +26,8 @@ from core.wire.market import (
     TaskRequest,
 )
 from core.wire.plant import (
-    Colour,
     DockState,
-    Fruit,
-    Inventory,
-    NewFruit,
     PlantState,
-    Scan,
     Settings,
     SettingsPatch,
     StationState,
@@ -113,6 +109,7 @@ def _inventory_routes(app: FastAPI, pot: Pot) -> None:
 
     @app.post("/inventory/scans", tags=["inventory"], summary="Merge what a scan saw")
     async def scan(response: Response, caller: Caller = allow("robot", "operator"), seen: Scan = body(Scan)) -> Inventory:
+        speaks_for(caller, seen.robot_id or caller.subject)
         merged = await pot.shelf.merge(seen)
         response.headers["etag"] = etag(merged)
         return merged
@@ -155,7 +152,7 @@ def _task_routes(app: FastAPI, pot: Pot) -> None:
 
     @app.post("/tasks", tags=["tasks"], summary="Ask for water", status_code=201)
     async def ask(response: Response, caller: Caller = allow("operator"), request: TaskRequest = body(TaskRequest)) -> Task:
-        task = await pot.water(request.dose_ml, request.priority, caller.subject)
+        task = await pot.ask(request, caller.subject)
         response.headers["location"] = f"/tasks/{task.task_id}"
         return task
 

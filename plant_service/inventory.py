@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from core.errors import NotFound, PreconditionFailed
 from core.wire.documents import Document
-from core.wire.plant import Fruit, Inventory, NewFruit, Scan
+from core.wire.fruit import Fruit, Inventory, NewFruit, Scan
 
 SCANS_KEPT = 32
 FRUITS_MAX = 500

@@ -12,7 +12,7 @@ from core.clock import Clock
 from core.errors import DriverError, Refused, StorageError, Unavailable, Unprocessable
 from core.soil import Limits, ProbeState, Reading
 from core.wire.documents import NodeCard
-from core.wire.market import Reservation, ReservationRequest, Task
+from core.wire.market import Reservation, ReservationRequest, Task, TaskRequest
 from core.wire.plant import DockState, PlantState, Settings, SettingsPatch, SoilReading
 from hw.ports import SoilProbe
 from hw.protocols.vh400 import Calibration
@@ -152,10 +152,12 @@ class Pot:
 
     # What others ask for
 
-    async def water(self, dose_ml: float | None, priority: int, by: str) -> Task:
-        """An operator wants water here; raises Conflict or Refused."""
-        dose = dose_ml if dose_ml is not None else self.care.machine.settings.dose_ml
-        return await self.place.change(lambda m, now_s: m.ask("water", dose, by, "asked by hand", now_s, priority))
+    async def ask(self, request: TaskRequest, by: str) -> Task:
+        """An operator wants water here; raises Conflict, Refused, or Unprocessable for what does not fit together."""
+        if request.kind != "water":
+            raise Unprocessable(f"cannot ask for {request.kind} yet", hint="ask for water")
+        dose = request.dose_ml if request.dose_ml is not None else self.care.machine.settings.dose_ml
+        return await self.place.change(lambda m, now_s: m.ask("water", dose, by, "asked by hand", now_s, request.priority))
 
     async def set_care(self, patch: SettingsPatch, by: str) -> Settings:
         settings = await self.care.change(lambda care: care.change(patch))

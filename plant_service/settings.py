@@ -54,6 +54,10 @@ class PlantSettings(BaseSettings):
     day_cap_ml: Annotated[float, Field(gt=0, le=10000)] = 1500.0
     probe_every_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
     soak_s: Annotated[float, Field(ge=0, le=3600)] = 60.0
+    inventory_every_s: Annotated[float, Field(ge=60, le=1e7)] = 43200.0
+    uncertainty_max: Annotated[float, Field(gt=0, le=1)] = 0.4
+    harvest: bool = True
+    """Ask for fruit that was seen ripe to be picked; without it only when somebody orders."""
     place: Point3 = Point3(x_m=0.0, y_m=0.0, z_m=0.0)
     """Where a station stands."""
     docks: tuple[DockSettings, ...] = ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from starlette.responses import Response
 
 from core.clock import Clock
-from core.wire.plant import Fruit, Inventory, NewFruit, Scan
+from core.wire.fruit import Fruit, Inventory, NewFruit, Scan
 from plant_service.inventory import Fruits, InventoryDocument, etag
 from plant_service.keeper import Keeper
 

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from core.wire.documents import Document, Identifier, Millilitres, Ratio, Seconds, Sentence
+from core.wire.fruit import Fruit, Pick
 from core.wire.geometry import Point3, Pose2
 
 TaskKind = Literal["water", "inventory", "harvest", "probe", "scan", "survey", "spray", "charge", "refill"]
 TaskState = Literal["announced", "awarded", "running", "done", "failed", "cancelled"]
 FINAL_STATES = ("done", "failed", "cancelled")
 Epoch = Annotated[int, Field(ge=0, le=2**53)]
+OrderId = Annotated[str, Field(max_length=80)]
+"""Whose order a harvest belongs to; empty: the plant's own wish."""
+ANNOUNCED_FRUITS_MAX = 64
+PICKS_MAX = 64
 
 BID_WINDOW_S = 2.0
 REALLOCATE_S = 10.0
@@ -44,6 +49,11 @@ class Announcement(Document):
     priority: Annotated[int, Field(ge=0, le=9)] = 5
     holder: Annotated[str, Field(max_length=80)] = ""
     """The robot that has the task now, when the plant asks again."""
+    fruits: Annotated[list[Fruit], Field(max_length=ANNOUNCED_FRUITS_MAX)] = []
+    """`harvest`: those to pick, in this order. `inventory`: what is known, to be looked for again."""
+    count: Annotated[int, Field(ge=0, le=ANNOUNCED_FRUITS_MAX)] = 0
+    """`harvest`: how many of them are wanted; the rest are there to choose from."""
+    order_id: OrderId = ""
 
 
 class Breakdown(Document):
@@ -87,6 +97,8 @@ class Report(Document):
     progress: Ratio = 0.0
     reason: Sentence = ""
     delivered_ml: Millilitres | None = None
+    picks: Annotated[list[Pick], Field(max_length=PICKS_MAX)] = []
+    """`harvest`: every pick of this task and epoch that has ended, in every report: the plant may have missed one."""
 
 
 class ReportAnswer(Document):
@@ -104,6 +116,8 @@ class PermitRequest(Document):
     epoch: Epoch
     act: Literal["water", "pick"]
     amount_ml: Annotated[float, Field(ge=0, le=500)] = 0.0
+    fruit_id: Annotated[str, Field(max_length=80)] = ""
+    """`pick`: the one fruit."""
 
 
 class Permit(Document):
@@ -113,7 +127,8 @@ class Permit(Document):
     task_id: Identifier
     epoch: Epoch
     act: Literal["water", "pick"]
-    dose_ml: Millilitres
+    dose_ml: Millilitres = 0.0
+    fruit_id: Annotated[str, Field(max_length=80)] = ""
     valid_for_s: Seconds
 
 
@@ -153,6 +168,13 @@ class Task(Document):
     delivered_ml: Millilitres | None = None
     phase: Sentence = ""
     progress: Ratio = 0.0
+    fruit_ids: list[Identifier] = []
+    """`harvest`: those that may be picked, in this order."""
+    count: Annotated[int, Field(ge=0)] = 0
+    """`harvest`: how many are wanted."""
+    order_id: OrderId = ""
+    picks: list[Pick] = []
+    """`harvest`: how each fruit's pick ended."""
     reason: Sentence = ""
     permit_id: str = ""
     permits: int = 0
@@ -163,9 +185,24 @@ class Task(Document):
 class TaskRequest(Document):
     """`POST /tasks` at a plant, by an operator."""
 
-    kind: Literal["water"]
+    kind: Literal["water", "inventory", "harvest"]
     dose_ml: Annotated[float, Field(gt=0, le=500)] | None = None
+    """`water` only; the pot's own dose if not given."""
+    count: Annotated[int, Field(ge=1, le=ANNOUNCED_FRUITS_MAX)] | None = None
+    """`harvest` only: how many ripe fruit; all of them if not given."""
+    fruit_ids: Annotated[list[Identifier], Field(max_length=ANNOUNCED_FRUITS_MAX)] = []
+    """`harvest` only: just these."""
+    order_id: OrderId = ""
+    """`harvest` only."""
     priority: Annotated[int, Field(ge=0, le=9)] = 5
+
+    @model_validator(mode="after")
+    def _fits_its_kind(self) -> TaskRequest:
+        if self.kind != "water" and self.dose_ml is not None:
+            raise ValueError(f"dose_ml means nothing to {self.kind}")
+        if self.kind != "harvest" and (self.count is not None or self.fruit_ids or self.order_id):
+            raise ValueError(f"count, fruit_ids and order_id mean nothing to {self.kind}")
+        return self
 
 
 class ReservationRequest(Document):

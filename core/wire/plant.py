@@ -7,13 +7,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from core.wire.documents import Document, Identifier, Millilitres, Ratio, Seconds, Sentence
+from core.wire.fruit import FruitCounts
 from core.wire.geometry import Point3, Pose2
 from core.wire.market import PlantCard
-
-Colour = Literal["green", "turning", "red"]
-Pixels = Annotated[float, Field(ge=-1e5, le=1e5)]
-GardenSeconds = Annotated[float, Field(ge=0, le=1e12)]
-"""A time on the garden's clock."""
 
 
 class SoilReading(Document):
@@ -36,6 +32,12 @@ class Settings(Document):
     probe_every_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
     soak_s: Annotated[float, Field(ge=0, le=3600)] = 60.0
     """After a dose the water needs this long to reach the probe."""
+    inventory_every_s: Annotated[float, Field(ge=60, le=1e7)] = 43200.0
+    """A scan is asked for at the latest after this long, and sooner when what is known has grown too uncertain."""
+    uncertainty_max: Annotated[float, Field(gt=0, le=1)] = 0.4
+    """Of the inventory: above it the pot asks for a scan."""
+    harvest: bool = True
+    """Ask for fruit that was seen ripe to be picked; without it only when somebody orders."""
 
 
 class SettingsPatch(Document):
@@ -47,6 +49,9 @@ class SettingsPatch(Document):
     day_cap_ml: Annotated[float, Field(gt=0, le=10000)] | None = None
     probe_every_s: Annotated[float, Field(ge=1, le=3600)] | None = None
     soak_s: Annotated[float, Field(ge=0, le=3600)] | None = None
+    inventory_every_s: Annotated[float, Field(ge=60, le=1e7)] | None = None
+    uncertainty_max: Annotated[float, Field(gt=0, le=1)] | None = None
+    harvest: bool | None = None
 
 
 class PlantState(Document):
@@ -61,47 +66,13 @@ class PlantState(Document):
     open_tasks: list[str] = []
     watered_today_ml: Millilitres = 0.0
     dock_holder: str = ""
+    fruit: FruitCounts = FruitCounts()
+    """Of the inventory."""
+    fruit_uncertainty: Ratio = 1.0
+    """Of the inventory: 0 just scanned, 1 nothing known."""
     waiting: Sentence = ""
     """Why nothing happens although the pot is thirsty; empty when nothing is amiss."""
     card: PlantCard
-
-
-class NewFruit(Document):
-    """`POST /inventory/fruits`: the paper's five and the position in the plant frame."""
-
-    colour: Colour
-    confidence: Ratio = 0.75
-    x_m: Annotated[float, Field(ge=-5, le=5)]
-    y_m: Annotated[float, Field(ge=-5, le=5)]
-    z_m: Annotated[float, Field(ge=-5, le=5)]
-    radius_m: Annotated[float, Field(gt=0, le=0.2)]
-    robot_pose: Pose2 | None = None
-    """Base pose relative to the plant when it was seen."""
-    image_x_px: Pixels | None = None
-    image_y_px: Pixels | None = None
-
-
-class Fruit(NewFruit):
-    """One fruit of the inventory, with its identity and when it was first and last seen."""
-
-    fruit_id: Identifier
-    first_seen_s: GardenSeconds = 0.0
-    last_seen_s: GardenSeconds = 0.0
-
-
-class Scan(Document):
-    """`POST /inventory/scans`: fruits seen, upserted by id. The same `scan_id` again changes nothing."""
-
-    scan_id: Identifier
-    fruits: Annotated[list[Fruit], Field(max_length=200)]
-
-
-class Inventory(Document):
-    """`GET /inventory`; its generation is the ETag."""
-
-    plant_id: Identifier
-    generation: int = 0
-    fruits: list[Fruit] = []
 
 
 class DockState(Document):

@@ -20,27 +20,46 @@ CARD = {
 }
 ANNOUNCED = {
     "task_id": "plant-1:9:9", "kind": "water", "plant": CARD, "dose_ml": 50.0, "priority": 3, "holder": "robot-1",
+    "fruits": [], "count": 0, "order_id": "",
 }  # fmt: skip
 FRUIT = {
     "colour": "red", "confidence": 0.8, "x_m": 0.1, "y_m": 0.0, "z_m": 0.3, "radius_m": 0.014, "robot_pose": POSE,
-    "image_x_px": 3.0, "image_y_px": 4.0,
+    "image_x_px": 3.0, "image_y_px": 4.0, "sigma_m": 0.01, "ripeness": 0.9,
 }  # fmt: skip
-SEEN = FRUIT | {"fruit_id": "s1", "first_seen_s": 0.0, "last_seen_s": 1.0}
+SEEN = FRUIT | {
+    "fruit_id": "s1", "first_seen_s": 0.0, "last_seen_s": 1.0, "seen_count": 1, "missed_count": 0, "unreachable": "",
+    "failed": "", "in_doubt": False,
+}  # fmt: skip
+VIEW = {
+    "x_m": 0.4, "y_m": 0.0, "z_m": 0.3, "look": {"x": -1.0, "y": 0.0, "z": 0.0}, "up": {"x": 0.0, "y": 0.0, "z": 1.0},
+    "fov_x_rad": 0.9, "fov_y_rad": 0.7, "range_m_min": 0.1, "range_m_max": 1.0,
+}  # fmt: skip
+SCAN = {
+    "scan_id": "scan-1", "task_id": "", "robot_id": "robot-1", "views": [VIEW], "sightings": [FRUIT | {"views": [0]}],
+    "detector": {"recall": 0.8, "precision": 0.9}, "fruits": [SEEN],
+}  # fmt: skip
+PICK = {
+    "fruit_id": "f1", "outcome": "failed", "reason": "slipped", "permit_id": "", "torn_green": 0, "torn_other": 0,
+    "took_s": 9.0,
+}  # fmt: skip
 REPORT = {
     "robot_id": "robot-1", "epoch": 1, "state": "running", "phase": "drive", "progress": 0.5, "reason": "",
-    "delivered_ml": 1.0,
+    "delivered_ml": 1.0, "picks": [PICK],
 }  # fmt: skip
+TASK = {"kind": "water", "dose_ml": 40.0, "count": None, "fruit_ids": [], "order_id": "", "priority": 5}
 RESERVE = {"robot_id": "robot-1", "dock_id": "", "for_s": 3.0, "yielding": True}
 GOOD: dict[tuple[str, str, str], dict[str, Any]] = {
     ("plant", "PATCH", "/settings"): {
         "threshold_ratio": 0.2, "target_ratio": 0.24, "dose_ml": 100.0, "day_cap_ml": 900.0, "probe_every_s": 9.0,
-        "soak_s": 5.0,
+        "soak_s": 5.0, "inventory_every_s": 9000.0, "uncertainty_max": 1.0, "harvest": False,
     },
     ("plant", "POST", "/inventory/fruits"): FRUIT,
-    ("plant", "POST", "/inventory/scans"): {"scan_id": "scan-1", "fruits": [SEEN]},
-    ("plant", "POST", "/tasks"): {"kind": "water", "dose_ml": 40.0, "priority": 5},
+    ("plant", "POST", "/inventory/scans"): SCAN,
+    ("plant", "POST", "/tasks"): TASK,
     ("plant", "POST", "/tasks/{task_id}/reports"): REPORT,
-    ("plant", "POST", "/tasks/{task_id}/permits"): {"robot_id": "robot-1", "epoch": 1, "act": "water", "amount_ml": 50.0},
+    ("plant", "POST", "/tasks/{task_id}/permits"): {
+        "robot_id": "robot-1", "epoch": 1, "act": "water", "amount_ml": 50.0, "fruit_id": "",
+    },
     ("plant", "POST", "/dock/reservations"): RESERVE,
     ("station", "POST", "/dock/reservations"): RESERVE | {"dock_id": "tap"},
     ("station", "POST", "/tap"): {"robot_id": "robot-1", "open_s": 2.0},
@@ -51,7 +70,7 @@ GOOD: dict[tuple[str, str, str], dict[str, Any]] = {
     ("sim", "PATCH", "/clock"): {"speed": 3.0, "paused": False},
     ("sim", "POST", "/faults"): {"kind": "wheel_slip", "target": "robot-1", "duration_s": 1.0, "strength": 2.0},
     ("console", "POST", "/api/stop"): {"reason": "a test"},
-    ("console", "POST", "/api/plants/{plant_id}/water"): {"kind": "water", "dose_ml": 40.0, "priority": 5},
+    ("console", "POST", "/api/plants/{plant_id}/water"): TASK,
 }  # fmt: skip
 """A body that each endpoint takes, with every field it knows: the bad ones are this one, changed in one place."""
 BIG = 5_000_000
