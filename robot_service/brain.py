@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 
 import httpx
@@ -11,6 +12,7 @@ from core.allocation.epochs import owner_of
 from core.allocation.queue import Entry, TaskQueue
 from core.clock import Clock
 from core.errors import Forbidden, Unavailable, Unprocessable
+from core.geometry.pinhole import from_fov
 from core.mesh.auth import Caller, Identity, Verifier
 from core.mesh.client import Mesh, PeerTransport
 from core.mesh.events import EventLog
@@ -26,6 +28,7 @@ from core.wire.robot import Job, JobRequest, Position, QueuedTask, RobotState, S
 from hw.links import Opener
 from robot_service.bodylink import BodyLink
 from robot_service.docks import Docks
+from robot_service.eye import Eye, Pictures
 from robot_service.ground import Ground
 from robot_service.localisation import Localisation
 from robot_service.neighbours import Neighbours
@@ -33,7 +36,7 @@ from robot_service.planner import Planner
 from robot_service.reporter import Reporter
 from robot_service.robot import Robot, launch_of
 from robot_service.scheduler import Scheduler
-from robot_service.settings import RobotSettings
+from robot_service.settings import NEED_EYE, RobotSettings
 
 TURNING_S = 3.0
 STOP_ANSWER_S = 2.0
@@ -53,6 +56,7 @@ class Brain:
         mesh: Mesh,
         peers: Peers,
         rng: random.Random,
+        eye: Eye,
     ) -> None:
         self.settings, self.clock = settings, clock
         self.body = BodyLink(settings.body_url, settings.secret(), opener, clock)
@@ -61,7 +65,7 @@ class Brain:
         self.events = EventLog(clock)
         neighbours = Neighbours(settings.id, peers, mesh, clock, lambda: self.robot.moving, lambda: where.pose, self._idle)
         self.robot = Robot(
-            settings, clock, rng, self.body, where, Ground(settings.map), neighbours, mesh, peers, self.events
+            settings, clock, rng, self.body, where, Ground(settings.map), neighbours, mesh, peers, self.events, eye
         )
         self.docks = Docks(settings.id, mesh, peers, clock)
         self.queue = TaskQueue()
@@ -99,7 +103,7 @@ class Brain:
         return NodeCard(
             id=self.settings.id,
             kind="robot",
-            capabilities=list(self.settings.capabilities),
+            capabilities=[name for name in self.settings.capabilities if name in self._can()],
             place=place,
             links={name: f"{self.settings.url}/{name}" for name in ("state", "position", "tasks", "history", "docs")},
         )
@@ -177,6 +181,11 @@ class Brain:
             self._travels = {k: v for k, v in self._travels.items() if k[0] == key[0]} | {key: time_s}
         return time_s
 
+    def _can(self) -> frozenset[str]:
+        """What it is fitted for and has what it takes."""
+        blind = frozenset() if self.robot.eye.fitted else frozenset(NEED_EYE)
+        return frozenset(self.settings.capabilities) - blind
+
     def condition(self) -> Condition:
         body, where = self.body.state, self.robot.where
         head = self.queue.next()
@@ -184,7 +193,7 @@ class Brain:
         docks = self.settings.map.docks
         return Condition(
             robot_id=self.settings.id,
-            can=frozenset(self.settings.capabilities),
+            can=self._can(),
             travel=self.travel_s,
             stopped_by=(body.stopped_by if body is not None and body.stopped else None),
             down=(self.body.down,) if self.body.down else tuple(body.down if body is not None else ("body",)),
@@ -226,7 +235,7 @@ class Brain:
         check_owner(award.announcement, caller)
         if self.robot.peers.find(plant_id) is None or self.settings.map.dock(plant_id) is None:
             raise Unprocessable(f"{plant_id} is not a plant we know")
-        if award.announcement.kind not in self.settings.capabilities:
+        if award.announcement.kind not in self._can():
             raise Unprocessable(f"cannot {award.announcement.kind}")
         entry = self.queue.award(award, self.clock.now())
         self.robot.note("award", f"{entry.kind} for {plant_id}", task_id=entry.task_id, epoch=entry.epoch)
@@ -342,12 +351,15 @@ def build(
     verifier: Verifier | None = None,
     peers: Peers | None = None,
     open_reads: bool = True,
+    pictures: Pictures | None = None,
 ) -> Node:
-    """One robot's brain as a node. `verifier` None switches authentication off, for tests."""
+    """One robot's brain as a node. `verifier` None switches authentication off, for tests; `pictures` is its camera."""
     from robot_service.api import make_app
 
     mesh = Mesh(transport, identity, clock)
-    brain = Brain(settings, clock, opener, mesh, peers if peers is not None else Peers(), rng)
+    lens = from_fov(*gardener.CAMERA_PIXELS, math.radians(gardener.CAMERA_FOV_Y_DEG))
+    eye = Eye(pictures, settings.detector, lens, clock)
+    brain = Brain(settings, clock, opener, mesh, peers if peers is not None else Peers(), rng, eye)
     app = make_app(brain, verifier, open_reads)
     app.state.brain = brain
     loops = (brain.body.run, brain.robot.neighbours.run, brain.docks.run, brain.reporter.run, brain.scheduler.run)

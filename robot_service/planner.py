@@ -8,16 +8,20 @@ from core.allocation.bidding import BATTERY_ENOUGH_RATIO, Travel
 from core.allocation.queue import Entry
 from core.errors import GardenError, PeerDown
 from core.mesh.client import retry
+from core.wire.fruit import Inventory, Pick
 from core.wire.market import Announcement, Permit, PermitRequest, Report
 from core.wire.robot import JobRequest
 from robot_service.docks import Docks
+from robot_service.eye import JPEG_COST_S, Look, drawn_jpeg
 from robot_service.robot import RANK_IDLE, Robot, SkillFailed, reason_of, tuple_of
 from robot_service.skills.dock import dock_at
 from robot_service.skills.drive import drive_to, undock
+from robot_service.skills.pick import KeepPicture, harvest
+from robot_service.skills.scan import scan
 from robot_service.skills.supply import charge, refill
 from robot_service.skills.water import Poured, water
 
-TASK_S = {"water": 900.0, "charge": 5 * 3600.0, "refill": 900.0, "job": 900.0}
+TASK_S = {"water": 900.0, "inventory": 600.0, "harvest": 1800.0, "charge": 5 * 3600.0, "refill": 900.0, "job": 900.0}
 """Longest time for a whole task; a longer one is given back."""
 
 
@@ -49,12 +53,17 @@ class Planner:
             progress=1.0 if state == "done" else entry.progress,
             reason=reason,
             delivered_ml=delivered_ml,
+            picks=list(entry.picks),
         )
 
     async def _perform(self, entry: Entry, poured: Poured) -> None:
         self.robot.activity.waiting = ""
         if entry.kind == "water" and entry.announcement is not None:
             await self._water(entry, entry.announcement, poured)
+        elif entry.kind == "inventory" and entry.announcement is not None:
+            await self._inventory(entry, entry.announcement)
+        elif entry.kind == "harvest" and entry.announcement is not None:
+            await self._harvest(entry, entry.announcement)
         elif entry.kind == "charge":
             await charge(
                 self.robot, self.docks, self.travel, lambda ratio: entry.killed != "" and ratio > BATTERY_ENOUGH_RATIO
@@ -70,13 +79,80 @@ class Planner:
         await dock_at(self.robot, self.docks, asked.plant.plant_id)
         self.robot.activity.job = "act"
         entry.progress = 0.6
-        await water(self.robot, asked.plant, lambda: self._permit(entry, asked), poured)
-
-    async def _permit(self, entry: Entry, asked: Announcement) -> tuple[Permit, float]:
-        """Ask the plant for leave to pour. A lost answer is asked for again under the same key, and is the same permit."""
-        plant = self.robot.peers.get(asked.plant.plant_id)
         wish = PermitRequest(robot_id=self.robot.settings.id, epoch=entry.epoch, act="water", amount_ml=asked.dose_ml)
+        await water(self.robot, asked.plant, lambda: self._permit(entry, asked, wish), poured)
+
+    async def _inventory(self, entry: Entry, asked: Announcement) -> None:
+        await dock_at(self.robot, self.docks, asked.plant.plant_id)
+        self.robot.activity.job = "act"
+        entry.progress = 0.4
+        scan_id = f"{asked.task_id}:{self.robot.settings.id}:{entry.epoch}"
+        seen = await scan(self.robot, asked.plant, scan_id, asked.task_id)
+        entry.progress = 0.9
+        plant = self.robot.peers.get(asked.plant.plant_id)
+
+        async def tell() -> Inventory:
+            self.robot.state()
+            return await self.robot.mesh.call(plant, "POST", "/inventory/scans", seen, expect=Inventory, key=scan_id)
+
+        try:
+            known = await retry(self.robot.clock, self.robot.rng, tell, tries=6, base_s=0.3, cap_s=4.0)
+        except PeerDown:
+            raise SkillFailed("the plant did not take the scan") from None
+        self.robot.note("scan", f"{len(seen.sightings)} fruit seen, {len(known.fruits)} known", task_id=asked.task_id)
+
+    async def _harvest(self, entry: Entry, asked: Announcement) -> None:
+        await dock_at(self.robot, self.docks, asked.plant.plant_id)
+        self.robot.activity.job = "act"
+        entry.progress = 0.3
+        wanted = asked.count or len(asked.fruits)
+
+        async def leave(fruit_id: str) -> tuple[Permit, float]:
+            wish = PermitRequest(robot_id=self.robot.settings.id, epoch=entry.epoch, act="pick", fruit_id=fruit_id)
+            return await self._permit(entry, asked, wish)
+
+        def ended(pick: Pick) -> None:
+            entry.picks.append(pick)
+            picked = sum(one.outcome == "picked" for one in entry.picks)
+            entry.progress = 0.3 + 0.6 * picked / max(1, wanted)
+            self.robot.note("pick", f"{pick.fruit_id} {pick.outcome}: {pick.reason}".rstrip(": "), task_id=asked.task_id)
+            # Between two fruit the task may be taken away; what is held is carried to the basket first.
+            entry.committed = False
+            if entry.killed:
+                raise SkillFailed(entry.killed)
+
+        before = len(entry.picks)
+        await harvest(self.robot, asked.plant, asked.fruits, wanted, leave, self._keep_picture(asked), ended)
+        picks = entry.picks[before:]
+        if not any(pick.outcome == "picked" for pick in picks):
+            raise SkillFailed("; ".join(f"{pick.fruit_id}: {pick.reason}" for pick in picks)[:400] or "nothing to pick")
+
+    def _keep_picture(self, asked: Announcement) -> KeepPicture:
+        """Sends pictures to the plant's ledger. Evidence, not the deed: a plant that does not take one changes nothing."""
+
+        async def keep(permit: Permit, when: str, look: Look) -> None:
+            plant = self.robot.peers.get(asked.plant.plant_id)
+            try:
+                picture = await self.robot.clock.offload(lambda: drawn_jpeg(look), JPEG_COST_S)
+                answer = await self.robot.mesh.exchange(
+                    plant,
+                    "PUT",
+                    f"/ledger/{permit.permit_id}/{when}.jpg",
+                    picture,
+                    headers={"content-type": "image/jpeg"},
+                )
+                if answer.status >= 400:
+                    self.robot.note("picture", f"{when} was not taken: HTTP {answer.status}", task_id=asked.task_id)
+            except GardenError as error:
+                self.robot.note("picture", f"{when} was not taken: {error}", task_id=asked.task_id)
+
+        return keep
+
+    async def _permit(self, entry: Entry, asked: Announcement, wish: PermitRequest) -> tuple[Permit, float]:
+        """Ask the plant for leave to act. A lost answer is asked for again under the same key, and is the same permit."""
+        plant = self.robot.peers.get(asked.plant.plant_id)
         asked_s = self.robot.clock.now()
+        key = f"permit-{asked.task_id}-{entry.epoch}" + (f"-{wish.fruit_id}" if wish.fruit_id else "")
 
         async def ask() -> Permit:
             self.robot.state()
@@ -86,15 +162,16 @@ class Planner:
                 f"/tasks/{asked.task_id}/permits",
                 wish,
                 expect=Permit,
-                key=f"permit-{asked.task_id}-{entry.epoch}",
+                key=key,
             )
 
         entry.committed = True
         try:
             permit = await retry(self.robot.clock, self.robot.rng, ask, tries=4, base_s=0.3, cap_s=2.0)
         except PeerDown:
-            raise SkillFailed("the plant did not answer whether it may be watered") from None
-        entry.progress = 0.75
+            raise SkillFailed("the plant did not answer whether we may act") from None
+        if wish.act == "water":
+            entry.progress = 0.75
         return permit, asked_s
 
     async def _job(self, job: JobRequest) -> None:

@@ -115,6 +115,7 @@ class Reporter:
             state="running" if entry.running else "awarded",
             phase=entry.phase,
             progress=entry.progress,
+            picks=list(entry.picks),
         )
         epoch, asked_s = entry.epoch, self.robot.clock.now()
         try:

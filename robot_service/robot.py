@@ -11,7 +11,7 @@ from typing import Any
 
 from core.allocation.right_of_way import RANK_BUSY, RANK_DRIVING, RANK_IDLE
 from core.clock import Clock
-from core.errors import GardenError, Refused
+from core.errors import GardenError
 from core.geometry.planar import Point, Pose
 from core.mesh.client import Mesh
 from core.mesh.events import EventLog
@@ -21,6 +21,8 @@ from core.scenario import launch_pose
 from core.wire.body import BodyState
 from core.wire.geometry import Pose2
 from robot_service.bodylink import BodyLink
+from robot_service.eye import Eye
+from robot_service.failed import SkillFailed
 from robot_service.ground import Ground
 from robot_service.localisation import Localisation
 from robot_service.neighbours import Neighbours
@@ -31,10 +33,6 @@ DEVICE_PATIENCE_S = 15.0
 """A device may be unplugged and plugged in again within this time without failing the task."""
 
 __all__ = ["RANK_BUSY", "RANK_DRIVING", "RANK_IDLE", "Activity", "Halted", "Robot", "SkillFailed"]
-
-
-class SkillFailed(Refused):
-    """A job could not be done; the message is the reason given to the plant."""
 
 
 class Halted(SkillFailed):
@@ -64,6 +62,7 @@ class Robot:
     mesh: Mesh
     peers: Peers
     events: EventLog
+    eye: Eye
     activity: Activity = field(default_factory=Activity)
     _last: BodyState | None = None
     _felt: BodyState | None = None

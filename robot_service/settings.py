@@ -13,7 +13,9 @@ from core.robots import gardener
 from core.robots.garden_map import GardenMap
 from core.wire.geometry import Pose2
 
-CAPABILITIES = ("water", "charge", "refill")
+CAPABILITIES = ("water", "inventory", "harvest", "charge", "refill")
+NEED_EYE = ("inventory", "harvest")
+"""What a robot without a camera cannot do."""
 
 
 class RobotSettings(BaseSettings):
@@ -31,6 +33,10 @@ class RobotSettings(BaseSettings):
     create: Literal["create1", "create2"] = "create2"
     docking: Literal["seek-dock", "beam"] = "seek-dock"
     localisation: Literal["kalman", "exponential"] = "kalman"
+    camera_url: str = ""
+    """The camera in the hand: `http://HOST/PATH.jpg` or `.mjpg`, `v4l2:/dev/videoN`, `file:PATTERN`. Empty: no camera."""
+    detector: Annotated[str, Field(max_length=200)] = "best"
+    """How it finds fruit: `filter`, `features`, `best`, or your own `MODULE:FUNCTION`."""
     home: Pose2
     map: GardenMap
     capabilities: Annotated[tuple[str, ...], NoDecode] = CAPABILITIES

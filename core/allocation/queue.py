@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from core.errors import NotFound, Refused
+from core.wire.fruit import Pick
 from core.wire.market import Announcement, Award, TaskKind
 from core.wire.robot import JobRequest
 
@@ -38,6 +39,8 @@ class Entry:
     """Why it was taken away; empty while it is ours."""
     phase: str = ""
     progress: float = 0.0
+    picks: list[Pick] = field(default_factory=list)
+    """`harvest`: how each fruit's pick ended so far."""
 
 
 @dataclass(slots=True)

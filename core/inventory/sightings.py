@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from core.geometry.pinhole import Camera
 from core.manipulation.servo import FRUIT_RADIUS_M, Target
-from core.perception.detection import Detection
+from core.perception.detection import COLOURS, Colour, Detection
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,6 @@ MEET_M = 0.02
 RADII_M = (0.006, 0.024)
 ROUNDS, ROUNDS_PLAIN = 12, 4
 """Of Gauss-Newton: the first find the neighbourhood, in the rest an outlier loses its weight."""
-COLOURS = ("green", "turning", "red")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +51,7 @@ class Seen:
     """(3,) [m]."""
     sigma_m: float
     radius_m: float
-    colour: str
+    colour: Colour
     confidence: float
     views: tuple[int, ...]
     """Indices of the views that saw it."""
@@ -291,7 +290,9 @@ def _twins(a: _Track, b: _Track) -> bool:
 
 
 def _seen(track: _Track) -> Seen:
-    votes = {colour: sum(h.confidence for h in track.hits.values() if h.colour == colour) for colour in COLOURS}
+    votes: dict[Colour, float] = {
+        colour: sum(h.confidence for h in track.hits.values() if h.colour == colour) for colour in COLOURS
+    }
     missed = float(np.prod([1.0 - 0.95 * min(hit.confidence, 1.0) for hit in track.hits.values()]))
     best = max(track.hits, key=lambda view: (track.hits[view].confidence, -view))
     return Seen(

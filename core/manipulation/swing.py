@@ -42,10 +42,10 @@ class Leg:
     duration_s: float
 
 
-def leg_s(a: Joints, b: Joints, speed_share: float = SPEED_SHARE) -> float:
-    """How long a straight joint-space move takes [s], by its slowest servo."""
+def leg_s(a: Joints, b: Joints, speed_share: float = SPEED_SHARE, least_s: float = LEG_S_MIN) -> float:
+    """How long a straight joint-space move takes [s], by its slowest servo; `least_s` at least."""
     moves = zip(ARM_JOINTS, a, b, strict=True)
-    return max(LEG_S_MIN, *(abs(y - x) / (speed_share * SERVOS[name].speed_radps_max) for name, x, y in moves))
+    return max(least_s, *(abs(y - x) / (speed_share * SERVOS[name].speed_radps_max) for name, x, y in moves))
 
 
 def obstruction(q: Joints, soil_height_m: float = SOIL_HEIGHT_M) -> str:

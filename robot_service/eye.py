@@ -1,0 +1,118 @@
+"""The robot's eye: fresh pictures from the camera in its hand, and the fruit that a detector finds in them.
+
+Detection runs off the loop: while it works the brain answers bids.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from core.clock import Clock
+from core.errors import GardenError
+from core.geometry.pinhole import NO_DISTORTION, Camera, undistort
+from core.perception.detection import Detection, Detector, Image
+from core.perception.registry import detector
+from core.wire.fruit import Accuracy
+from robot_service.failed import SkillFailed
+
+DETECT_COST_S = 0.06
+JPEG_COST_S = 0.01
+JPEG_QUALITY = 80
+FRESH_S = 3.0
+"""A camera that gives no new picture within this time is silent."""
+
+
+class Frame(Protocol):
+    """One picture of the driver."""
+
+    @property
+    def image(self) -> Image: ...
+
+    @property
+    def stamp_s(self) -> float: ...
+
+
+class Pictures(Protocol):
+    """What the eye needs of a camera driver."""
+
+    async def fresh(self, after_s: float) -> Frame:
+        """The first picture taken after `after_s` [garden s]; raises GardenError when none comes or it is useless."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """One picture and what was found in it; circles in pixels of a lens without distortion."""
+
+    image: Image
+    detections: tuple[Detection, ...]
+    stamp_s: float
+
+
+class Eye:
+    """`lens` describes the camera as calibrated. The detector and its libraries are loaded at the first look."""
+
+    def __init__(
+        self, pictures: Pictures | None, detector_name: str, lens: Camera, clock: Clock, accuracy: Accuracy | None = None
+    ) -> None:
+        self._pictures, self._name, self._clock, self._lens = pictures, detector_name, clock, lens
+        self._detector: Detector | None = None
+        self.camera = replace(lens, distortion=NO_DISTORTION)
+        """What the circles of a `Look` obey."""
+        self.accuracy = accuracy or Accuracy()
+        self.last: Look | None = None
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there is a camera at all."""
+        return self._pictures is not None
+
+    async def look(self) -> Look:
+        """A picture taken from now on, with its fruit. Raises SkillFailed when the camera gives none that can be used."""
+        if self._pictures is None:
+            raise SkillFailed("this robot has no camera")
+        try:
+            async with self._clock.timeout(FRESH_S):
+                frame = await self._pictures.fresh(self._clock.now())
+        except TimeoutError:
+            raise SkillFailed(f"the camera gave no picture for {FRESH_S:g} s") from None
+        except GardenError as error:
+            raise SkillFailed(f"the camera cannot be used: {error}") from error
+        image = frame.image
+        found = await self._clock.offload(lambda: self._detect(image), DETECT_COST_S)
+        self.last = Look(image=image, detections=tuple(map(self._straight, found)), stamp_s=frame.stamp_s)
+        return self.last
+
+    def _detect(self, image: Image) -> list[Detection]:
+        if self._detector is None:
+            self._detector = detector(self._name)
+        return self._detector(image)
+
+    def _straight(self, circle: Detection) -> Detection:
+        """The circle where a lens without distortion would have put it."""
+        lens = self._lens
+        if lens.distortion == NO_DISTORTION:
+            return circle
+        bent = np.array([(circle.u_px - lens.cx) / lens.fx, (circle.v_px - lens.cy) / lens.fy])
+        x, y = undistort(lens.distortion, bent)
+        return replace(circle, u_px=float(lens.cx + lens.fx * x), v_px=float(lens.cy + lens.fy * y))
+
+
+_BGR = {"green": (60, 200, 60), "turning": (30, 150, 240), "red": (40, 40, 230)}
+
+
+def drawn_jpeg(look: Look) -> bytes:
+    """The picture with a ring round every fruit that was found, as JPEG; slow: offload it."""
+    import cv2
+
+    picture = look.image.copy()
+    for circle in look.detections:
+        centre = (round(circle.u_px), round(circle.v_px))
+        cv2.circle(picture, centre, max(2, round(circle.radius_px)), _BGR[circle.colour], 2, cv2.LINE_AA)
+        text = f"{circle.colour} {circle.confidence:.2f}"
+        cv2.putText(picture, text, (centre[0] + 4, centre[1]), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _BGR[circle.colour], 1)
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return data.tobytes()

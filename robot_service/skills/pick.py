@@ -1,0 +1,376 @@
+"""Harvest (paper 000, section 6, Algorithm 3): look, servo, permit, grasp, pull, check, basket. Done at the dock.
+
+The hand comes in and goes out along its own axis. Success is what force and camera both say: something is held, and the
+fruit is gone from where it hung.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from core.errors import Refused
+from core.manipulation.approach import (
+    LOOK_M,
+    READY_M,
+    RETREAT_M,
+    Approach,
+    Obstacle,
+    approaches,
+    opening_for,
+    way_in,
+)
+from core.manipulation.arm import Joints, Point3, inverse
+from core.manipulation.eye import camera_pose
+from core.manipulation.kinematics import Array
+from core.manipulation.servo import GATE_CHI2, Target, interaction_matrix, servo_step
+from core.manipulation.swing import Leg, leg_s, swing
+from core.perception.detection import Detection
+from core.robots import gardener
+from core.wire.fruit import Fruit, Pick
+from core.wire.market import Permit, PlantCard
+from robot_service.eye import Look
+from robot_service.robot import Robot, SkillFailed
+from robot_service.skills.arm import SETTLE_S, fold_arm, joints_now, move_arm
+from robot_service.skills.plantframe import mapped, plant_in_base
+
+WAYS_MAX = 3
+"""From so many directions a fruit is looked for before it is given up."""
+LOOKS_MAX = 10
+"""Of one servo run."""
+BLIND_MAX = 2
+"""Pictures in a row without the fruit."""
+DOCKING_SIGMA_M = 0.012
+"""The plant's frame is known this well from a dock: the robot's own pose error."""
+SIGMA_M_MIN = 0.008
+NEAR_SIDE_M, NEAR_DEPTH_M = 0.004, 0.008
+"""The servo is content when the fruit is this near to the middle between the fingers, and to its distance."""
+FAR_OFF_M = 0.03
+"""A fruit this far from where the inventory has it is another one."""
+HELD_N = 0.8
+"""Squeeze above which something is between the fingers."""
+GRIP_N_MAX = 9.0
+CLOSE_S = 0.6
+CLOSE_TICK_M = 0.004
+GRASPS_MAX = 2
+FAST_SHARE = 0.5
+PULL_SHARE = 0.15
+TWIST_RAD = 0.30
+"""The hand tips up while it pulls: the stalk bends over its knuckle and breaks at less force."""
+RELEASE_S = 0.4
+
+TakePermit = Callable[[str], Awaitable[tuple[Permit, float]]]
+"""Asks the plant for leave to pick this fruit; returns the permit and when it was asked for [garden s]."""
+KeepPicture = Callable[[Permit, str, Look], Awaitable[None]]
+"""Sends the picture `before` or `after` a pick to the plant; must not fail."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """What a harvest hands to each pick."""
+
+    robot: Robot
+    plant: PlantCard
+    T_base_plant: Array
+    take_permit: TakePermit
+    keep_picture: KeepPicture
+
+
+async def harvest(
+    robot: Robot,
+    plant: PlantCard,
+    fruits: Sequence[Fruit],
+    count: int,
+    take_permit: TakePermit,
+    keep_picture: KeepPicture,
+    ended: Callable[[Pick], None],
+    known: Sequence[Fruit] = (),
+) -> None:
+    """Pick up to `count` of `fruits`, those with the most room first. `ended` hears of each as soon as it is over."""
+    task = Task(
+        robot=robot,
+        plant=plant,
+        T_base_plant=plant_in_base(robot.pose(), plant),
+        take_permit=take_permit,
+        keep_picture=keep_picture,
+    )
+    left = list(fruits)
+    hanging = {fruit.fruit_id: fruit for fruit in (*known, *fruits)}
+    picked = 0
+    while left and picked < count:
+        fruit = _outermost(task, left, list(hanging.values()))
+        left.remove(fruit)
+        others = [other for other in hanging.values() if other.fruit_id != fruit.fruit_id]
+        robot.activity.waiting = f"picks {fruit.fruit_id}, {picked} of {count} in the basket"
+        began_s = robot.clock.now()
+        pick = await _pick(task, fruit, others)
+        ended(pick.model_copy(update={"took_s": robot.clock.now() - began_s}))
+        if pick.outcome == "picked":
+            picked += 1
+            del hanging[fruit.fruit_id]
+    robot.activity.waiting = ""
+    await fold_arm(robot)
+
+
+def _place(task: Task, fruit: Fruit) -> Point3:
+    return mapped(task.T_base_plant, (fruit.x_m, fruit.y_m, fruit.z_m))
+
+
+def _obstacles(task: Task, fruits: Sequence[Fruit]) -> list[Obstacle]:
+    return [Obstacle(centre=_place(task, fruit), radius_m=fruit.radius_m) for fruit in fruits]
+
+
+def _outermost(task: Task, left: Sequence[Fruit], hanging: Sequence[Fruit]) -> Fruit:
+    """The fruit with the most room about it; ties by the order asked for."""
+
+    def room(fruit: Fruit) -> float:
+        others = [other for other in hanging if other.fruit_id != fruit.fruit_id]
+        try:
+            return approaches(_place(task, fruit), fruit.radius_m, _obstacles(task, others))[0].room_m
+        except Refused:
+            return -1.0
+
+    return max(left, key=room)
+
+
+async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit]) -> Pick:
+    """One fruit, from looking for it to the basket."""
+    robot, place, obstacles = task.robot, _place(task, fruit), _obstacles(task, others)
+    try:
+        ways = approaches(place, fruit.radius_m, obstacles)
+    except Refused as error:
+        return Pick(fruit_id=fruit.fruit_id, outcome="unreachable", reason=str(error)[:500])
+    why = "not seen where the inventory has it"
+    for way in ways[:WAYS_MAX]:
+        target = Target.expected(np.array(place), max(fruit.sigma_m, SIGMA_M_MIN) + DOCKING_SIGMA_M, fruit.radius_m)
+        try:
+            await _swing(robot, way.look, way.opening_m)
+            why = await servo(robot, way.pitch_rad, target, fruit.colour, place)
+        except Refused as error:
+            why = str(error)
+        if not why:
+            return await _take(task, fruit, way, target)
+    return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason=f"from {min(len(ways), WAYS_MAX)} sides: {why}"[:500])
+
+
+async def servo(robot: Robot, pitch_rad: float, target: Target, colour: str, place: Point3) -> str:
+    """Bring the hand to `READY_M` before the fruit by what the camera sees; why it did not, or empty.
+
+    Image-based: the features' error through the inverse interaction matrix gives the camera's next step; the distance in
+    it comes from all pictures so far, not from the radius alone. Raises Refused when a step leaves the arm's reach.
+    """
+    blind = 0
+    for _ in range(LOOKS_MAX):
+        look = await robot.eye.look()
+        T_base_cam = camera_pose(joints_now(robot))
+        circle = best_match(robot, look.detections, target, T_base_cam, colour)
+        if circle is None:
+            blind += 1
+            if blind > BLIND_MAX:
+                return "the camera does not see it"
+            continue
+        blind = 0
+        target.see(robot.eye.camera, T_base_cam, np.array([circle.u_px, circle.v_px, circle.radius_px]))
+        if float(np.linalg.norm(target.p_base - np.array(place))) > FAR_OFF_M + DOCKING_SIGMA_M:
+            return "what the camera sees hangs too far from where the inventory has the fruit"
+        gap = T_base_cam[:3, :3].T @ (target.p_base - T_base_cam[:3, 3]) - GOAL_IN_CAMERA_M
+        if np.hypot(gap[0], gap[1]) < NEAR_SIDE_M and abs(gap[2]) < NEAR_DEPTH_M:
+            return ""
+        await _step(robot, pitch_rad, target, T_base_cam)
+    return "the hand did not settle before it"
+
+
+GOAL_IN_CAMERA_M: Array = np.array(
+    [
+        -gardener.CAMERA_IN_HAND_M[1],
+        gardener.CAMERA_IN_HAND_M[2],
+        gardener.HAND_M + READY_M - gardener.CAMERA_IN_HAND_M[0],
+    ]
+)
+"""Where the fruit is, in the camera's frame, when the tool is `READY_M` short of it."""
+
+
+async def _step(robot: Robot, pitch_rad: float, target: Target, T_base_cam: Array) -> None:
+    """One step of the control law."""
+    camera = robot.eye.camera
+    u, v, r = target.features(camera, T_base_cam)
+    goal = replace_target(target, T_base_cam).features(camera, T_base_cam)
+    L = interaction_matrix(camera, u, v, r, target.radius_m)
+    step = T_base_cam[:3, :3] @ servo_step(L, np.array([u, v, r]) - goal)
+    at = T_base_cam[:3, 3] + step
+    q = inverse((float(at[0]), float(at[1]), float(at[2])), pitch_rad, gardener.CAMERA_IN_HAND_M)
+    now = joints_now(robot)
+    await move_arm(robot, [Leg(q=q, duration_s=leg_s(now, q, FAST_SHARE))])
+
+
+def replace_target(target: Target, T_base_cam: Array) -> Target:
+    """The same fruit where the servo wants to have it in the picture."""
+    return Target(p_base=T_base_cam[:3, :3] @ GOAL_IN_CAMERA_M + T_base_cam[:3, 3], P=target.P, radius_m=target.radius_m)
+
+
+def best_match(
+    robot: Robot, circles: Sequence[Detection], target: Target, T_base_cam: Array, colour: str
+) -> Detection | None:
+    """The detection that is most likely the target, within its gate; never of the opposite colour."""
+    opposite = {"red": "green", "green": "red"}.get(colour)
+    scored = [
+        (target.distance2(robot.eye.camera, T_base_cam, np.array([c.u_px, c.v_px, c.radius_px])), index)
+        for index, c in enumerate(circles)
+        if c.colour != opposite
+    ]
+    within = [pair for pair in scored if pair[0] < GATE_CHI2]
+    return circles[min(within)[1]] if within else None
+
+
+async def _take(task: Task, fruit: Fruit, way: Approach, target: Target) -> Pick:
+    """The irreversible part: under a permit, and nothing of it is begun after the permit's validity."""
+    robot = task.robot
+    before = await robot.eye.look()
+    permit, asked_s = await task.take_permit(fruit.fruit_id)
+    await task.keep_picture(permit, "before", before)
+    why = ""
+    for _ in range(GRASPS_MAX):
+        if robot.clock.now() - asked_s > permit.valid_for_s:
+            why = why or "the permit ran out"
+            break
+        try:
+            held = await _grasp(robot, way, target)
+        except Refused as error:
+            why = str(error)
+            break
+        if held:
+            return await _carry(task, fruit, way, target, permit)
+        why = "nothing was held: the force sensor felt no fruit"
+        await _go_along(robot, _reversed_way(target, way), PULL_SHARE, opening_for(target.radius_m))
+        try:
+            lost = await servo(robot, way.pitch_rad, target, fruit.colour, _place(task, fruit))
+        except Refused as error:
+            lost = str(error)
+        if lost:
+            why = f"{why}; then {lost}"
+            break
+    await task.keep_picture(permit, "after", await robot.eye.look())
+    return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason=why[:500], permit_id=permit.permit_id)
+
+
+def _point(p: Array) -> Point3:
+    return float(p[0]), float(p[1]), float(p[2])
+
+
+def _reversed_way(target: Target, way: Approach) -> list[Joints]:
+    return list(way_in(_point(target.p_base), way.pitch_rad, 0.0, READY_M))
+
+
+async def _grasp(robot: Robot, way: Approach, target: Target) -> bool:
+    """Advance straight onto the fruit and close; whether the force sensor feels it."""
+    opening_m = opening_for(target.radius_m)
+    await _go_along(robot, way_in(_point(target.p_base), way.pitch_rad, READY_M, 0.0), FAST_SHARE, opening_m)
+    await close_gripper(robot)
+    force_n = robot.state().force_n
+    if force_n is None:
+        raise SkillFailed("the force sensor is silent: whether anything is held cannot be told")
+    return force_n > HELD_N
+
+
+async def close_gripper(robot: Robot) -> None:
+    """Close until the force sensor feels something firmly, or the fingers meet."""
+    until_s = robot.clock.now() + CLOSE_S + SETTLE_S
+    q = joints_now(robot)
+    while robot.clock.now() < until_s:
+        robot.body.want(arm=q, arm_s=0.1, gripper_m=0.0)
+        await robot.tick()
+
+
+async def _carry(task: Task, fruit: Fruit, way: Approach, target: Target, permit: Permit) -> Pick:
+    """Pull it off, see that it came, lay it into the basket."""
+    robot = task.robot
+    feared = await _pull(robot, way, target)
+    after = await robot.eye.look()
+    await task.keep_picture(permit, "after", after)
+    force_n = robot.state().force_n
+    held = force_n is not None and force_n > HELD_N
+    T_base_cam = camera_pose(joints_now(robot))
+    still = best_match(robot, after.detections, _sharp(target), T_base_cam, fruit.colour)
+    if not held:
+        where = "it still hangs there" if still is not None else "it fell"
+        await open_gripper(robot, way.opening_m)
+        return Pick(
+            fruit_id=fruit.fruit_id,
+            outcome="failed",
+            reason=f"slipped out of the fingers{feared}: {where}",
+            permit_id=permit.permit_id,
+        )
+    await to_basket(robot)
+    remark = "held by force; another fruit shows where it hung" if still is not None else ""
+    return Pick(fruit_id=fruit.fruit_id, outcome="picked", reason=remark, permit_id=permit.permit_id)
+
+
+def _sharp(target: Target) -> Target:
+    """Only a circle just where the fruit was counts as the fruit still there."""
+    return replace(target, P=np.eye(3) * 0.006**2)
+
+
+async def _pull(robot: Robot, way: Approach, target: Target) -> str:
+    """Straight back, slowly, the hand tipping up; a remark when the squeeze went beyond its limit."""
+    fruit, start = _point(target.p_base), joints_now(robot)
+    path = [start]
+    for share in (0.15, 0.3, 0.45, 0.6, 0.8, 1.0):
+        tilt = TWIST_RAD * min(1.0, share / 0.6)
+        try:
+            path.append(_tilted(fruit, way.pitch_rad, share * RETREAT_M, tilt))
+        except Refused:
+            path.append(_tilted(fruit, way.pitch_rad, share * RETREAT_M, 0.0))
+    await _go_along(robot, path, PULL_SHARE, 0.0)
+    force_n = robot.state().force_n
+    return f" (squeezed with {force_n:.1f} N)" if force_n is not None and force_n > GRIP_N_MAX else ""
+
+
+def _tilted(fruit: Point3, pitch_rad: float, back_m: float, tilt_rad: float) -> Joints:
+    from core.manipulation.approach import along
+
+    return inverse(along(fruit, pitch_rad, back_m), pitch_rad + tilt_rad)
+
+
+async def _go_along(robot: Robot, path: Sequence[Joints], share: float, opening_m: float) -> None:
+    """Run a path without stopping between its points; the gripper at `opening_m` all the while."""
+    robot.body.rest(False)
+    now = joints_now(robot)
+    for q in path:
+        duration_s = max(0.08, leg_s(now, q, share, least_s=0.0))
+        until_s = robot.clock.now() + duration_s
+        while robot.clock.now() < until_s:
+            robot.body.want(arm=q, arm_s=duration_s, gripper_m=opening_m)
+            await robot.tick()
+        now = q
+    settled_s = robot.clock.now() + SETTLE_S
+    while robot.clock.now() < settled_s:
+        robot.body.want(arm=now, arm_s=0.1, gripper_m=opening_m)
+        await robot.tick()
+
+
+async def _swing(robot: Robot, goal: Joints, opening_m: float) -> None:
+    """To a pose by clear legs, the gripper opening on the way."""
+    for leg in swing(joints_now(robot), goal):
+        await _go_along(robot, (leg.q,), FAST_SHARE, opening_m)
+
+
+async def open_gripper(robot: Robot, opening_m: float = gardener.GRIPPER_OPEN_M) -> None:
+    q, until_s = joints_now(robot), robot.clock.now() + RELEASE_S
+    while robot.clock.now() < until_s:
+        robot.body.want(arm=q, arm_s=0.1, gripper_m=opening_m)
+        await robot.tick()
+
+
+async def to_basket(robot: Robot) -> None:
+    """Over the basket without letting go, and open."""
+    for leg in swing(joints_now(robot), BASKET_RAD):
+        await _go_along(robot, (leg.q,), FAST_SHARE, 0.0)
+    await open_gripper(robot)
+
+
+BASKET_RAD: Joints = gardener.ARM_BASKET_RAD
+"""The tool over the basket, pointing down."""
+
+__all__ = ["LOOK_M", "Task", "close_gripper", "harvest", "open_gripper", "servo", "to_basket"]

@@ -1,0 +1,105 @@
+"""Inventory (paper 000, Algorithm 2): six camera poses before the plant, detect, lift, tell the plant. Done at the dock."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from core.errors import Refused
+from core.inventory.sightings import Seen, fuse
+from core.inventory.sightings import View as ScanView
+from core.manipulation.eye import camera_pose, scan_poses
+from core.manipulation.kinematics import Array
+from core.manipulation.swing import swing
+from core.wire.fruit import FRUITS_MAX, Direction, Scan, Sighting, View
+from core.wire.market import PlantCard
+from robot_service.robot import Robot, SkillFailed
+from robot_service.skills.arm import fold_arm, joints_now, move_arm
+from robot_service.skills.plantframe import base_in_plant, mapped, plant_in_base
+
+FUSE_COST_S = 0.02
+RANGE_M_MAX = 0.9
+RANGE_M_MIN = 0.08
+MARGIN_RATIO = 0.9
+"""Only what lies this far inside the picture counts as seen or missed: at the edge a fruit is cut."""
+
+
+async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Scan:
+    """Look from six poses and fuse what was seen. Raises SkillFailed when the camera or the arm does not do its part."""
+    T_base_plant = plant_in_base(robot.pose(), plant)
+    T_plant_base = np.linalg.inv(T_base_plant)
+    try:
+        poses = scan_poses(mapped(T_base_plant, (0.0, 0.0, 0.0)))
+    except Refused as error:
+        raise SkillFailed(f"the arm cannot bring the camera before the plant: {error}") from error
+    views: list[ScanView] = []
+    for number, q in enumerate(poses):
+        await _go(robot, q)
+        look = await robot.eye.look()
+        views.append(ScanView(T_plant_cam=T_plant_base @ camera_pose(joints_now(robot)), detections=look.detections))
+        robot.activity.waiting = f"view {number + 1} of {len(poses)}: {len(look.detections)} fruit"
+    robot.activity.waiting = ""
+    camera = robot.eye.camera
+    seen = await robot.clock.offload(lambda: fuse(camera, views), FUSE_COST_S)
+    await fold_arm(robot)
+    return document(robot, plant, scan_id, task_id, views, seen)
+
+
+async def _go(robot: Robot, q: tuple[float, float, float, float]) -> None:
+    try:
+        legs = swing(joints_now(robot), q)
+    except Refused as error:
+        raise SkillFailed(f"the arm cannot get into its scanning pose: {error}") from error
+    await move_arm(robot, legs)
+
+
+def document(robot: Robot, plant: PlantCard, scan_id: str, task_id: str, views: list[ScanView], seen: list[Seen]) -> Scan:
+    """The scan as the plant takes it; the surest fruit if there are more than it takes."""
+    camera, pose = robot.eye.camera, base_in_plant(robot.pose(), plant)
+    half_x = math.atan(MARGIN_RATIO * camera.width / 2 / camera.fx)
+    half_y = math.atan(MARGIN_RATIO * camera.height / 2 / camera.fy)
+    best = sorted(seen, key=lambda fruit: -fruit.confidence)[:FRUITS_MAX]
+    return Scan(
+        scan_id=scan_id,
+        task_id=task_id,
+        robot_id=robot.settings.id,
+        views=[_view(view.T_plant_cam, 2 * half_x, 2 * half_y) for view in views],
+        sightings=[
+            Sighting(
+                x_m=float(fruit.p[0]),
+                y_m=float(fruit.p[1]),
+                z_m=float(fruit.p[2]),
+                sigma_m=min(1.0, max(0.001, fruit.sigma_m)),
+                radius_m=fruit.radius_m,
+                colour=fruit.colour,
+                confidence=fruit.confidence,
+                robot_pose=pose,
+                image_x_px=fruit.image_x_px,
+                image_y_px=fruit.image_y_px,
+                views=list(fruit.views),
+            )
+            for fruit in best
+        ],
+        detector=robot.eye.accuracy,
+    )
+
+
+def _view(T_plant_cam: Array, fov_x_rad: float, fov_y_rad: float) -> View:
+    look, up, at = T_plant_cam[:3, 2], -T_plant_cam[:3, 1], T_plant_cam[:3, 3]
+    return View(
+        x_m=float(at[0]),
+        y_m=float(at[1]),
+        z_m=float(at[2]),
+        look=_direction(look),
+        up=_direction(up),
+        fov_x_rad=fov_x_rad,
+        fov_y_rad=fov_y_rad,
+        range_m_min=RANGE_M_MIN,
+        range_m_max=RANGE_M_MAX,
+    )
+
+
+def _direction(v: Array) -> Direction:
+    x, y, z = (float(np.clip(value, -1.0, 1.0)) for value in v)
+    return Direction(x=x, y=y, z=z)
