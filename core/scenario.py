@@ -44,6 +44,8 @@ class Climate(_Section):
     start_hour: Annotated[float, Field(ge=0, lt=24)] = 10.0
     litres_per_day: Annotated[float, Field(ge=0, le=5)] = 0.5
     """What a grown plant and its soil give off on a day."""
+    growth: Annotated[float, Field(ge=0, le=1000)] = 1.0
+    """How much faster than in life fruit grow and ripen."""
 
 
 class Plant(_Section):

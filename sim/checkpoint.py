@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sim.pot import Pot
     from sim.world import World
 
-VERSION = 1
+VERSION = 2
 PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
@@ -36,6 +36,8 @@ def taken(world: World) -> dict[str, Any]:
         "tap_ml": world.tap_ml,
         "taps": sorted(world.tap_board.open),
         "physics": state.tolist(),
+        "asleep": world.data.tree_asleep.tolist(),
+        "orchard": world.orchard.kept(),
         "robots": {name: _robot(robot) | {"tally": asdict(world.touch.tally[name])} for name, robot in world.robots.items()},
         "pots": {name: _pot(pot) for name, pot in world.pots.items()},
     }
@@ -51,7 +53,8 @@ def put_back(world: World, snapshot: dict[str, Any]) -> None:
     )
     if not same or len(snapshot["physics"]) != size or set(snapshot["pots"]) != set(world.pots):
         raise ConfigError("the checkpoint is of another world", hint="remove it, or start with its scenario and seed")
-    mujoco.mj_setState(world.model, world.data, np.array(snapshot["physics"]), PHYSICS)
+    world.orchard.put_back(snapshot["orchard"])
+    _put_physics(world, snapshot)
     world.time_s, world.spilt_ml, world.tap_ml = (float(snapshot[k]) for k in ("time_s", "spilt_ml", "tap_ml"))
     world.tap_board.open = set(snapshot["taps"])
     world.touch.forget()
@@ -60,6 +63,21 @@ def put_back(world: World, snapshot: dict[str, Any]) -> None:
         world.touch.tally[name] = Tally(**snapshot["robots"][name]["tally"])
     for name, pot in world.pots.items():
         _put_pot(pot, snapshot["pots"][name])
+
+
+def _put_physics(world: World, snapshot: dict[str, Any]) -> None:
+    """The state alone would wake every sleeper, so they are laid down again: MuJoCo does that at the end of a step only.
+
+    One step with everything awake but those about to fall asleep; then the state is put in place once more.
+    """
+    model, data = world.model, world.data
+    state, asleep = np.array(snapshot["physics"]), np.array(snapshot["asleep"], dtype=np.int32)
+    mujoco.mj_setState(model, data, state, PHYSICS)
+    data.tree_asleep[:] = np.where(asleep >= 0, -1, -100)
+    data.tree_awake[:] = 1
+    mujoco.mj_step(model, data)
+    mujoco.mj_setState(model, data, state, PHYSICS)
+    data.tree_asleep[:] = asleep
 
 
 def _robot(robot: RobotBody) -> dict[str, Any]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 
 import numpy as np
 
 from core.scenario import Plant
 from hw.protocols.vh400 import volts_of
+from sim.physics.pose import Planar
 from sim.physics.water import TAP_PIN
-from sim.scene.tomato import Shrub
 from sim.soil import Soil
 
 PROBE_PIN = 0
@@ -33,14 +34,19 @@ class ProbeFault(Enum):
 
 
 class Pot:
-    def __init__(self, plant: Plant, litres_per_day: float, shrub: Shrub, rng: np.random.Generator) -> None:
+    def __init__(self, plant: Plant, litres_per_day: float, rng: np.random.Generator) -> None:
         self.id = plant.id
         self.plant = plant
-        self.shrub = shrub
+        self.stem = Planar(plant.x_m, plant.y_m, math.radians(plant.dock_yaw_deg))
         self.soil = Soil.of(plant.soil_litres, plant.moisture_ratio, litres_per_day * plant.height_m / GROWN_M)
         self.rng = rng
         self.probe_fault = ProbeFault.OK
         self.stuck_v: float | None = None
+
+    @property
+    def thirst(self) -> float:
+        """0: it drinks all it wants; 1: it wilts."""
+        return 1.0 - self.soil.supply
 
     @property
     def place(self) -> tuple[float, float]:

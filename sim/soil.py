@@ -68,14 +68,18 @@ class Soil:
     def moisture_ratio(self) -> float:
         return self.stored_ml / self.volume_ml
 
+    @property
+    def supply(self) -> float:
+        """The part of its demand that the plant gets: 1 with plenty of water, 0 at the wilting point."""
+        return min(1.0, max(0.0, (self.moisture_ratio - WILTING_RATIO) / (STRESS_RATIO - WILTING_RATIO)))
+
     def pour(self, dose_ml: float) -> None:
         self.stored_ml += dose_ml
         self.poured_ml += dose_ml
 
     def advance(self, seconds: float, hour: float) -> None:
         """Let `seconds` pass (up to a few minutes at a time) at `hour` of the day."""
-        stress = (self.moisture_ratio - WILTING_RATIO) / (STRESS_RATIO - WILTING_RATIO)
-        loss_ml = demand_mlps(self.litres_per_day, hour) * seconds * min(1.0, max(0.0, stress))
+        loss_ml = demand_mlps(self.litres_per_day, hour) * seconds * self.supply
         self.stored_ml -= loss_ml
         self.given_off_ml += loss_ml
         excess_ml = self.stored_ml - CAPACITY_RATIO * self.volume_ml

@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict
 
 from core.wire.geometry import Point3, Pose2
 
+Colour = Literal["green", "turning", "red"]
+
 
 class _Fact(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -21,6 +23,12 @@ class Collisions(_Fact):
     robot_dock: int
     """Against a dock while not mated with it."""
     arm: int
+
+
+class ByColour(_Fact):
+    green: int
+    turning: int
+    red: int
 
 
 class RobotTruth(_Fact):
@@ -46,15 +54,44 @@ class RobotTruth(_Fact):
     pumped_ml: float
     docked_at: str | None
     collisions: Collisions
+    grip_n: float
+    """Mean squeeze on the pads, as the force sensor should have it."""
+    torn_gripped: ByColour
+    """Fruit that came off between its pads."""
+    torn_touched: ByColour
+    """Fruit that came off otherwise while its arm was by: brushed, dragged, struck."""
 
 
 class FruitTruth(_Fact):
+    """One fruit that is in the garden, wherever it is."""
+
     id: str
     position_plant: Point3
+    """Centre, in the frame of the plant that bore it."""
     position_world: Point3
     radius_m: float
-    colour: Literal["green", "turning", "red"]
+    colour: Colour
     ripeness: float
+    where: Literal["plant", "hand", "basket", "ground"]
+    robot_id: str | None
+    """Whose hand or basket."""
+    torn_by: str | None
+    """Which robot tore it off; None while it hangs, or when it dropped by itself."""
+    torn_how: Literal["grip", "touch"] | None
+    pull_n: float
+    """What its stalk bears now."""
+    strength_n: float
+    """Pull along its stalk that would break it; half of it when bent by 90 degrees or twisted by 180."""
+
+
+class GoneTruth(_Fact):
+    """A fruit that has left the garden: taken out of a robot's basket, or rotten on the ground."""
+
+    id: str
+    how: Literal["taken", "rotten"]
+    robot_id: str | None
+    colour: Colour
+    at_s: float
 
 
 class PlantTruth(_Fact):
@@ -65,6 +102,10 @@ class PlantTruth(_Fact):
     given_off_ml: float
     drained_ml: float
     fruit: tuple[FruitTruth, ...]
+    dropped: ByColour
+    """Fruit that fell with no robot near: overripe."""
+    gone: tuple[GoneTruth, ...]
+    """The last two hundred of the garden's."""
 
 
 class Truth(_Fact):

@@ -5,7 +5,6 @@ World frame as in `core.scenario`. Time is garden seconds from the scenario's `s
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import mujoco
@@ -19,13 +18,13 @@ from sim import checkpoint
 from sim.body import RobotBody
 from sim.devices.plants import BoardPins, CreateBody, MarkerCamera, ServoRig
 from sim.physics import beams
-from sim.physics.pose import Planar
+from sim.physics.fruit import Orchard, Spot, Tally
 from sim.physics.touch import Touch
 from sim.physics.water import TAP_MLPS, lands_in
 from sim.pot import Pot, TapBoard
 from sim.scene.build import DT_S, build
 from sim.scene.traits import generator
-from sim.truth import Collisions, FruitTruth, PlantTruth, RobotTruth, Truth
+from sim.truth import ByColour, Collisions, FruitTruth, GoneTruth, PlantTruth, RobotTruth, Truth
 
 TICK_S = 0.020
 STEPS_A_TICK = round(TICK_S / DT_S)
@@ -50,8 +49,9 @@ class World:
             r.id: RobotBody(scenario, r, seed, self.model, self.data, scene.traits[r.id]) for r in scenario.robots
         }
         litres = scenario.climate.litres_per_day
-        self.pots = {p.id: Pot(p, litres, scene.shrubs[p.id], generator(seed, f"probe/{p.id}")) for p in scenario.plants}
-        self._fruit = {name: _fruit_of(pot) for name, pot in self.pots.items()}
+        self.pots = {p.id: Pot(p, litres, generator(seed, f"probe/{p.id}")) for p in scenario.plants}
+        mujoco.mj_forward(self.model, self.data)
+        self.orchard = Orchard(scenario, seed, self.model, self.data, scene.shrubs)
         self.docks = [beams.Dock(name, pose) for name, pose in scenario.docks().items()]
         station = scenario.station
         self.tap_board = TapBoard(tuple(f"{station.id}/{dock.id}" for dock in station.docks if dock.tap))
@@ -104,11 +104,19 @@ class World:
     def _tick(self) -> None:
         for robot in self.robots.values():
             robot.before(TICK_S)
-        mujoco.mj_step(self.model, self.data, nstep=STEPS_A_TICK)
+        self._step()
         self.time_s += TICK_S
         self._look()
         self._pour(TICK_S)
         self._live(TICK_S)
+
+    def _step(self) -> None:
+        if not self.orchard.near():
+            mujoco.mj_step(self.model, self.data, nstep=STEPS_A_TICK)
+            return
+        for _ in range(STEPS_A_TICK):
+            mujoco.mj_step(self.model, self.data)
+            self.orchard.watch()
 
     def _look(self) -> None:
         """What devices may ask for after a tick."""
@@ -149,6 +157,9 @@ class World:
             pot.soil.advance(seconds, hour)
         for robot in self.robots.values():
             robot.live(seconds)
+        if self.orchard.live(self.time_s, {name: pot.thirst for name, pot in self.pots.items()}):
+            mujoco.mj_forward(self.model, self.data)
+            self._still = None
 
     # What the emulated devices hang on
 
@@ -229,6 +240,9 @@ class World:
             collisions=Collisions(
                 robot_robot=tally.robot_robot, robot_pot=tally.robot_pot, robot_dock=tally.robot_dock, arm=tally.arm
             ),
+            grip_n=robot.arm.grip_n(),
+            torn_gripped=_by_colour(self.orchard.torn[robot.id].grip),
+            torn_touched=_by_colour(self.orchard.torn[robot.id].touch),
         )
 
     def _plant_truth(self, pot: Pot) -> PlantTruth:
@@ -240,25 +254,36 @@ class World:
             poured_ml=soil.poured_ml,
             given_off_ml=soil.given_off_ml,
             drained_ml=soil.drained_ml,
-            fruit=self._fruit[pot.id],
+            fruit=tuple(
+                self._fruit_truth(pot, spot) for spot in self.orchard.spots if spot.plant_id == pot.id and spot.there
+            ),
+            dropped=_by_colour(self.orchard.fallen[pot.id]),
+            gone=tuple(
+                GoneTruth(id=gone.fruit_id, how=gone.how, robot_id=gone.robot_id, colour=gone.colour, at_s=gone.at_s)
+                for gone in self.orchard.gone
+                if gone.plant_id == pot.id
+            ),
+        )
+
+    def _fruit_truth(self, pot: Pot, spot: Spot) -> FruitTruth:
+        x_m, y_m, z_m = self.orchard.position_m(spot)
+        x_plant_m, y_plant_m = pot.stem.local(x_m, y_m)
+        where, robot_id = self.orchard.where(spot)
+        return FruitTruth(
+            id=spot.growing.fruit_id,
+            position_plant=Point3(x_m=x_plant_m, y_m=y_plant_m, z_m=z_m - g.SOIL_HEIGHT_M),
+            position_world=Point3(x_m=x_m, y_m=y_m, z_m=z_m),
+            radius_m=spot.drawn_m,
+            colour=spot.growing.colour,
+            ripeness=spot.growing.ripeness,
+            where=where,
+            robot_id=robot_id,
+            torn_by=spot.torn_by,
+            torn_how=spot.torn_how,
+            pull_n=self.orchard.pull_n(spot),
+            strength_n=spot.growing.strength_n,
         )
 
 
-def _fruit_of(pot: Pot) -> tuple[FruitTruth, ...]:
-    """Fixed as yet, so told once."""
-    stem = Planar(pot.plant.x_m, pot.plant.y_m, math.radians(pot.plant.dock_yaw_deg))
-    told = []
-    for berry in pot.shrub.berries:
-        x_m, y_m, z_m = berry.centre
-        x_world_m, y_world_m = stem.point(x_m, y_m)
-        told.append(
-            FruitTruth(
-                id=berry.fruit_id,
-                position_plant=Point3(x_m=x_m, y_m=y_m, z_m=z_m),
-                position_world=Point3(x_m=x_world_m, y_m=y_world_m, z_m=z_m + g.SOIL_HEIGHT_M),
-                radius_m=berry.radius_m,
-                colour=berry.colour,
-                ripeness=berry.ripeness,
-            )
-        )
-    return tuple(told)
+def _by_colour(tally: Tally) -> ByColour:
+    return ByColour(green=tally.green, turning=tally.turning, red=tally.red)

@@ -114,8 +114,10 @@ NOZZLE_IN_HAND_M = (0.11, 0.0, -0.02)
 
 ARM_HOME_RAD = (0.0, math.radians(150.0), math.radians(-150.0), math.radians(60.0))
 """Folded over the body: within the footprint while driving."""
-ARM_BASKET_RAD = (0.0, math.radians(165.0), math.radians(-80.0), math.radians(-81.0))
-"""The tool over the basket, hand level and pointing forward: opening the gripper drops the fruit 0.33 m into it."""
+BASKET_M, BASKET_HALF_M = (0.0625, 0.11, 0.18), (0.0525, 0.05, 0.045)
+"""Middle of what the basket on the left of the deck holds, and half its size, base frame."""
+ARM_BASKET_RAD = (math.radians(85.0), math.radians(102.2), math.radians(-143.3), math.radians(-48.9))
+"""The hand over the basket pointing straight down, the tool 0.25 m above the floor: fruit falls 0.1 m when it opens."""
 
 
 def gripper_opening_m(servo_rad: float) -> float:

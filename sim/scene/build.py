@@ -37,7 +37,7 @@ class Scene:
 
 def build(scenario: Scenario, seed: int) -> Scene:
     """Compiles the garden. The same scenario and seed give the same model."""
-    shrubs = {p.id: grow(p.id, p.height_m, p.fruit, generator(seed, f"shrub/{p.id}")) for p in scenario.plants}
+    shrubs = {p.id: grow(p.height_m, p.fruit, generator(seed, f"shrub/{p.id}")) for p in scenario.plants}
     traits = {robot.id: traits_of(robot.id, seed) for robot in scenario.robots}
     spec = mujoco.MjSpec()
     spec.modelname = scenario.name
@@ -56,6 +56,7 @@ def _options(spec: Any) -> None:
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = IMPRATIO
     spec.option.iterations = 20
+    spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
     for name, specular in (("turf", 0.05), ("soil", 0.02)):
         rgba = furniture.TURF_RGBA if name == "turf" else furniture.SOIL_RGBA
         spec.add_material(name=name, rgba=list(rgba), specular=specular)

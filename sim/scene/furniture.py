@@ -1,6 +1,6 @@
 """What stands still: the slab, pots with their shrubs, docks, the tap, ceiling markers and lamps.
 
-Names: `floor-slab`, `PLANT/pot`, `PLANT/soil`, `PLANT/fruit/ID`, `DOCK/dock` (DOCK as in `Scenario.docks`).
+Names: `floor-slab`, `PLANT/pot`, `PLANT/soil`, `DOCK/dock` (DOCK as in `Scenario.docks`).
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from core.robots import gardener as g
 from core.robots.markers import ceiling_markers
 from core.scenario import Arena, Plant, Scenario, StationDock
 from core.wire.geometry import Pose2
-from sim.scene.collide import FURNITURE, GROUND, NOTHING, VISUAL_GROUP
+from sim.scene.collide import FOR_FRUIT, FURNITURE, GROUND, NOTHING, VISUAL_GROUP
 from sim.scene.gardener import SLAB
-from sim.scene.tomato import STEM_RGBA, Shrub, rgba_of
+from sim.scene.hang import add_trusses
+from sim.scene.tomato import STEM_RGBA, Shrub
 
 BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE = (
     mujoco.mjtGeom.mjGEOM_BOX,
@@ -68,7 +69,7 @@ def _ceiling(world: Any, arena: Arena) -> None:
 
 
 def add_plant(spec: Any, plant: Plant, shrub: Shrub) -> None:
-    """Pot, dock and shrub. Everything that grows is fixed and untouchable: it costs a step almost nothing."""
+    """Pot, dock and shrub. Stem and leaves are fixed and untouchable: they cost a step almost nothing."""
     half_z = g.SOIL_HEIGHT_M / 2
     pot = spec.worldbody.add_body(
         name=plant.id,
@@ -78,8 +79,9 @@ def add_plant(spec: Any, plant: Plant, shrub: Shrub) -> None:
     pot.add_geom(name=f"{plant.id}/pot", type=CYLINDER, size=[g.POT_RADIUS_M, half_z - 0.004, 0], pos=[0, 0, half_z - 0.004],
                  rgba=POT_RGBA, friction=[0.3, 0.005, 0.0001], **FURNITURE)  # fmt: skip
     pot.add_geom(name=f"{plant.id}/soil", type=CYLINDER, size=[g.SOIL_RADIUS_M, 0.01, 0], pos=[0, 0, g.SOIL_HEIGHT_M - 0.01],
-                 rgba=SOIL_RGBA, material="soil", group=VISUAL_GROUP, **NOTHING)  # fmt: skip
+                 rgba=SOIL_RGBA, material="soil", group=VISUAL_GROUP, **FOR_FRUIT)  # fmt: skip
     _add_shrub(pot, plant.id, shrub)
+    add_trusses(spec, plant, shrub)
     _add_dock(spec, plant.id, plant.dock, depth_m=g.DOCK_TO_STEM_M - g.BODY_RADIUS_M - g.POT_RADIUS_M)
 
 
@@ -94,9 +96,6 @@ def _add_shrub(pot: Any, name: str, shrub: Shrub) -> None:
     for index, leaf in enumerate(shrub.leaves):
         pot.add_geom(name=f"{name}/leaf/{index}", type=ELLIPSOID, size=list(leaf.half_m), pos=up(leaf.centre),
                      quat=list(leaf.q_wxyz), rgba=leaf.rgba, **still)  # fmt: skip
-    for berry in shrub.berries:
-        pot.add_geom(name=f"{name}/fruit/{berry.fruit_id}", type=SPHERE, size=[berry.radius_m, 0, 0], pos=up(berry.centre),
-                     rgba=rgba_of(berry.ripeness), **still)  # fmt: skip
 
 
 def add_station_dock(spec: Any, name: str, dock: StationDock) -> None:

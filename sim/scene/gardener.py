@@ -12,7 +12,8 @@ import mujoco
 
 from core.robots import gardener as g
 from core.scenario import Robot
-from sim.scene.collide import A_SHELL, AN_ARM, HULL_GROUP, NOTHING, SITE_GROUP, VISUAL_GROUP
+from sim.scene.collide import A_SHELL, AN_ARM, FOR_FRUIT, HULL_GROUP, NOTHING, SITE_GROUP, VISUAL_GROUP
+from sim.scene.hang import GRIP_FRICTION, GRIP_SOLIMP, GRIP_SOLREF
 from sim.scene.traits import Traits
 
 BOX, CAPSULE, CYLINDER, SPHERE = (
@@ -76,23 +77,24 @@ def _hull(base: Any, name: str) -> None:
     base.add_geom(name=f"{name}/shell", mass=SHELL_KG, rgba=WHITE, group=VISUAL_GROUP, friction=[0.25, 0.005, 0.0001],
                   **A_SHELL, **shell)  # fmt: skip
     top = g.BODY_HEIGHT_M
+    (x, y, z), (bx, by, bz) = g.BASKET_M, (g.BASKET_HALF_M[0], g.BASKET_HALF_M[1], 0.04)
     parts = [
         ("deck", CYLINDER, [0.168, 0.004, 0], [0, 0, top + 0.004], DARK, 0.0),
         ("tank", BOX, [0.055, 0.085, 0.06], [-0.095, 0, top + 0.07], TANK_BLUE, TOWER_KG),
         ("notebook", BOX, [0.035, 0.11, 0.012], [0.0, 0, top + 0.025], GREY, 0.0),
         ("mast", CYLINDER, [0.022, (g.SHOULDER_Z_M - top) / 2, 0],
          [g.SHOULDER_X_M, 0, (g.SHOULDER_Z_M + top) / 2], GREY, MAST_KG),
-        ("basket-floor", BOX, [0.055, 0.08, 0.003], [-0.095, 0, top + 0.135], BLUE, 0.0),
-        ("basket-left", BOX, [0.055, 0.003, 0.025], [-0.095, 0.08, top + 0.16], BLUE, 0.0),
-        ("basket-right", BOX, [0.055, 0.003, 0.025], [-0.095, -0.08, top + 0.16], BLUE, 0.0),
-        ("basket-front", BOX, [0.003, 0.08, 0.025], [-0.040, 0, top + 0.16], BLUE, 0.0),
-        ("basket-back", BOX, [0.003, 0.08, 0.025], [-0.150, 0, top + 0.16], BLUE, 0.0),
+        ("basket-floor", BOX, [bx, by, 0.006], [x, y, z - bz - 0.006], BLUE, 0.0),
+        ("basket-left", BOX, [bx, 0.003, bz], [x, y + by + 0.003, z], BLUE, 0.0),
+        ("basket-right", BOX, [bx, 0.003, bz], [x, y - by - 0.003, z], BLUE, 0.0),
+        ("basket-front", BOX, [0.003, by, bz], [x + bx + 0.003, y, z], BLUE, 0.0),
+        ("basket-back", BOX, [0.003, by, bz], [x - bx - 0.003, y, z], BLUE, 0.0),
         ("bumper", BOX, [0.004, 0.10, 0.015], [0.166, 0, 0.055], DARK, 0.0),
         ("nose", BOX, [0.03, 0.008, 0.003], [0.13, 0, top + 0.01], (0.2, 0.75, 0.3, 1.0), 0.0),
     ]  # fmt: skip
     for part, kind, size, pos, rgba, mass in parts:
         base.add_geom(name=f"{name}/{part}", type=kind, size=size, pos=pos, rgba=rgba, mass=mass, group=VISUAL_GROUP,
-                      **NOTHING)  # fmt: skip
+                      **FOR_FRUIT)  # fmt: skip
 
 
 def _wheels(spec: Any, base: Any, robot: Robot, traits: Traits) -> None:
@@ -168,7 +170,8 @@ def _hand(spec: Any, hand: Any, name: str) -> None:
         finger.add_geom(name=f"{name}/rail-{side}", type=BOX, size=[0.035, 0.003, 0.006], pos=[0.035, sign * 0.011, 0],
                         mass=0.015, rgba=DARK, group=VISUAL_GROUP, **AN_ARM)  # fmt: skip
         finger.add_geom(name=f"{name}/pad-{side}", type=BOX, size=[0.014, 0.004, 0.012], pos=[0.08, sign * 0.004, 0],
-                        mass=0.010, rgba=DARK, group=VISUAL_GROUP, **AN_ARM)  # fmt: skip
+                        mass=0.010, rgba=DARK, group=VISUAL_GROUP, condim=4, friction=GRIP_FRICTION, solref=GRIP_SOLREF,
+                        solimp=GRIP_SOLIMP, priority=2, **AN_ARM)  # fmt: skip
         finger.add_site(name=f"{name}/pad-{side}", type=BOX, size=[0.016, 0.006, 0.014], pos=[0.08, sign * 0.004, 0],
                         group=SITE_GROUP)  # fmt: skip
         sensor = spec.add_sensor(name=f"{name}/touch-{side}", type=mujoco.mjtSensor.mjSENS_TOUCH,

@@ -1,7 +1,11 @@
-"""Procedural cherry tomato shrubs: a winding stem, compound leaves, trusses with fruit in all stages.
+"""Procedural cherry tomato shrubs: a winding stem, compound leaves, and trusses with places for fruit.
 
-Sizes as cherry tomatoes have them: fruit 22-32 mm across when full grown, trusses 6-9 fruit long, some 18-25 cm of stem
-between trusses, fruit about one and a half diameters apart along the truss.
+A truss is an axis of some 17 cm with fruit left and right of it, 20 to 26 mm of axis from one to the next; full-grown fruit
+is 23 to 32 mm across and weighs 12 g, as measured on cherry clusters (axis 170.5 mm, 3.3 mm thick at its root and 1.9 mm at
+its tip; fruit 30.5 mm, 11.7 g: design study of a cluster end effector, airobotsight.com/?p=3708). The pedicel's far part,
+from the joint (knuckle) where it breaks to the fruit, is 8 to 11 mm.
+Trusses leave the stem some 20 cm apart, three leaves between them.
+What hangs there, how big and how ripe it is: `sim.growth`. How it hangs and breaks: `sim.physics.fruit`.
 Plant frame: origin at the soil's centre, z up; x towards the dock.
 """
 
@@ -28,6 +32,15 @@ TURNING_FROM, RED_FROM = 0.45, 0.75
 DOCK_SIDE_RAD = math.radians(75.0)
 """Trusses are trained to the side that the robots can reach."""
 LEAVES_PER_METRE = 22
+TRUSS_FRUIT = 6
+"""On a truss of the length that was measured."""
+FIRST_TRUSS_M, TRUSS_APART_M, TOP_TRUSS_SHARE = 0.21, 0.20, 0.72
+"""Height of the lowest truss's root above the soil, of each further one above it; the topmost at this share of the plant."""
+PEDUNCLE_M = 0.055
+"""From the stem to the first fruit's pedicel."""
+AXIS_RADIUS_M = (0.00165, 0.00095)
+"""At the root, at the tip."""
+PEDICEL_RADIUS_M = 0.001
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,26 +63,30 @@ class Leaflet:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Berry:
-    """One fruit: centre [m] in the plant frame; ripeness 0..1."""
+class Place:
+    """Where a fruit hangs, or may come to hang."""
 
-    fruit_id: str
-    centre: Point
     knuckle: Point
-    """Where its stalk leaves the truss."""
-    radius_m: float
-    ripeness: float
+    """The joint of its pedicel [m], plant frame: above it the plant is firm, below it the fruit swings."""
+    stalk_m: float
+    """Length of the pedicel from the joint to the fruit."""
 
-    @property
-    def colour(self) -> Colour:
-        return colour_of(self.ripeness)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truss:
+    """One axis with its places, from the stem outwards; `flowering` ones bear nothing yet."""
+
+    rods: tuple[Rod, ...]
+    places: tuple[Place, ...]
+    flowering: bool
 
 
 @dataclass(slots=True)
 class Shrub:
     rods: list[Rod] = field(default_factory=list)
     leaves: list[Leaflet] = field(default_factory=list)
-    berries: list[Berry] = field(default_factory=list)
+    trusses: list[Truss] = field(default_factory=list)
+    """From below upwards, which is from old to young."""
 
 
 def colour_of(ripeness: float) -> Colour:
@@ -84,12 +101,12 @@ def rgba_of(ripeness: float) -> Rgba:
     return (r, g, b, a)
 
 
-def grow(plant_id: str, height_m: float, fruit: int, rng: np.random.Generator) -> Shrub:
-    """A shrub `height_m` tall with `fruit` berries, entirely by `rng`."""
+def grow(height_m: float, fruit: int, rng: np.random.Generator) -> Shrub:
+    """A shrub `height_m` tall with places for `fruit` fruit and, where there is room, a truss in flower; all by `rng`."""
     shrub = Shrub()
     spine = _stem(shrub, height_m, rng)
     _leaves(shrub, spine, height_m, rng)
-    _trusses(shrub, spine, plant_id, fruit, height_m, rng)
+    _trusses(shrub, spine, fruit, height_m, rng)
     return shrub
 
 
@@ -138,55 +155,39 @@ def _leaflet(root: npt.NDArray[np.float64], azimuth: float, petiole_m: float, rn
     )
 
 
-def _trusses(
-    shrub: Shrub, spine: npt.NDArray[np.float64], plant_id: str, fruit: int, height_m: float, rng: np.random.Generator
-) -> None:
-    """Trusses ripen from below upwards, and along each from the stem outwards."""
+def _trusses(shrub: Shrub, spine: npt.NDArray[np.float64], fruit: int, height_m: float, rng: np.random.Generator) -> None:
     if fruit == 0:
         return
-    count = max(1, math.ceil(fruit / 6))
-    sizes = [fruit // count + (index < fruit % count) for index in range(count)]
-    left = fruit
+    room = 1 + max(0, math.floor((TOP_TRUSS_SHARE * height_m - FIRST_TRUSS_M) / TRUSS_APART_M))
+    bearing = min(room, math.ceil(fruit / TRUSS_FRUIT))
+    sizes = [fruit // bearing + (index < fruit % bearing) for index in range(bearing)]
+    if bearing < room:
+        sizes.append(TRUSS_FRUIT)
     for index, size in enumerate(sizes):
-        share = (index + 0.5) / count
-        z_m = height_m * (0.22 + 0.58 * share) + rng.normal(0.0, 0.01)
+        z_m = FIRST_TRUSS_M + TRUSS_APART_M * index + rng.normal(0.0, 0.008)
         azimuth = DOCK_SIDE_RAD * (-1.0) ** index * rng.uniform(0.1, 0.9)
-        for nth, (knuckle, centre, radius_m) in enumerate(_truss(shrub, _along(spine, z_m), azimuth, size, rng)):
-            ripeness = float(np.clip(1.0 - 0.75 * share - 0.06 * nth + rng.normal(0.0, 0.06), 0.05, 0.98))
-            grown_m = radius_m * (0.75 + 0.25 * min(1.0, ripeness / TURNING_FROM))
-            shrub.berries.append(
-                Berry(
-                    fruit_id=f"{plant_id}-f{fruit - left + 1}",
-                    centre=_point(centre),
-                    knuckle=knuckle,
-                    radius_m=grown_m,
-                    ripeness=ripeness,
-                )
-            )
-            left -= 1
+        shrub.trusses.append(_truss(_along(spine, z_m), azimuth, size, index >= bearing, rng))
 
 
-def _truss(
-    shrub: Shrub, root: npt.NDArray[np.float64], azimuth: float, size: int, rng: np.random.Generator
-) -> list[tuple[Point, npt.NDArray[np.float64], float]]:
-    """A drooping axis with fruit hanging left and right of it: (knuckle, fruit centre, full-grown radius)."""
+def _truss(root: npt.NDArray[np.float64], azimuth: float, size: int, flowering: bool, rng: np.random.Generator) -> Truss:
+    """A drooping axis; pedicels leave it left and right in turn and bend down at their joints."""
     out = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     side = np.array([-out[1], out[0], 0.0])
-    hung = []
-    before, step_m = root, 0.06
+    rods, places = [], []
+    before, step_m = root, PEDUNCLE_M
     slope = 0.15
     for nth in range(size):
         along = out * math.cos(slope) + np.array([0.0, 0.0, math.sin(slope)])
         at = before + along * step_m
-        shrub.rods.append(Rod(a=_point(before), b=_point(at), radius_m=0.0016))
-        radius_m = float(np.clip(rng.normal(0.0135, 0.0012), 0.011, 0.016))
-        sway = side * (-1.0) ** nth * (radius_m + 0.004)
-        centre = at + sway + np.array([0.0, 0.0, -radius_m - 0.006]) + rng.normal(0.0, 0.001, 3)
-        shrub.rods.append(Rod(a=_point(at), b=_point(centre + np.array([0.0, 0.0, radius_m])), radius_m=0.001))
-        hung.append((_point(at), centre, radius_m))
+        thick_m = AXIS_RADIUS_M[0] + (AXIS_RADIUS_M[1] - AXIS_RADIUS_M[0]) * nth / TRUSS_FRUIT
+        rods.append(Rod(a=_point(before), b=_point(at), radius_m=max(thick_m, AXIS_RADIUS_M[1])))
+        reach_m = float(np.clip(rng.normal(0.018, 0.001), 0.016, 0.020))
+        knuckle = at + side * (-1.0) ** nth * reach_m + rng.normal(0.0, 0.001, 3)
+        rods.append(Rod(a=_point(at), b=_point(knuckle), radius_m=PEDICEL_RADIUS_M))
+        places.append(Place(knuckle=_point(knuckle), stalk_m=float(rng.uniform(0.008, 0.011))))
         before, step_m = at, rng.uniform(0.020, 0.026)
         slope -= 0.35
-    return hung
+    return Truss(rods=tuple(rods), places=tuple(places), flowering=flowering)
 
 
 def _point(vector: npt.NDArray[np.float64]) -> Point:
