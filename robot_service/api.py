@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Query, Response
+from fastapi.responses import StreamingResponse
 
+from core.errors import Unavailable
 from core.history import as_csv
 from core.mesh.auth import ROLES, Caller, Verifier
 from core.mesh.chassis import allow, body, create_app
@@ -13,7 +16,10 @@ from core.wire.documents import HistoryEntry
 from core.wire.market import Announcement, Award, Bid
 from core.wire.robot import Job, JobRequest, Position, QueuedTask, RobotState, Stopped, StopRequest
 from robot_service.brain import Brain, check_owner, queued
+from robot_service.eye import SHOW_EVERY_S
+from robot_service.failed import SkillFailed
 
+FILM_FRAMES_MAX = 10_000
 Id = Annotated[str, Path(max_length=80)]
 
 
@@ -28,6 +34,7 @@ def make_app(brain: Brain, verifier: Verifier | None, open_reads: bool = True) -
     )
     _market(app, brain)
     _readings(app, brain)
+    _camera(app, brain)
     _jobs(app, brain)
     _emergency(app, brain)
     return app
@@ -78,6 +85,37 @@ def _readings(app: FastAPI, brain: Brain) -> None:
     ) -> object:
         entries = brain.events.since(since)
         return Response(as_csv(entries), media_type="text/csv") if format == "csv" else entries
+
+
+def _camera(app: FastAPI, brain: Brain) -> None:
+    picture: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": {}}}}
+    stream: dict[int | str, dict[str, Any]] = {200: {"content": {"multipart/x-mixed-replace": {}}}}
+
+    @app.get("/camera.jpg", summary="What it sees, fruit ringed", tags=["camera"], responses=picture)
+    async def camera() -> Response:
+        return Response(await shown(), media_type="image/jpeg", headers={"cache-control": "no-store"})
+
+    @app.get("/camera.mjpg", summary="The same as a film", tags=["camera"], responses=stream)
+    async def film() -> StreamingResponse:
+        first = await shown()
+        return StreamingResponse(frames(first), media_type="multipart/x-mixed-replace; boundary=frame")
+
+    async def shown() -> bytes:
+        try:
+            return await brain.robot.eye.show()
+        except SkillFailed as error:
+            raise Unavailable(str(error), hint="GET /state tells how the robot is") from error
+
+    async def frames(first: bytes) -> AsyncIterator[bytes]:
+        """Ends when the camera does, or after `FILM_FRAMES_MAX`: whoever still watches asks again."""
+        data = first
+        for _ in range(FILM_FRAMES_MAX):
+            yield b"--frame\r\ncontent-type: image/jpeg\r\ncontent-length: %d\r\n\r\n%b\r\n" % (len(data), data)
+            await brain.clock.sleep(SHOW_EVERY_S)
+            try:
+                data = await shown()
+            except Unavailable:
+                return
 
 
 def _jobs(app: FastAPI, brain: Brain) -> None:

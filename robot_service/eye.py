@@ -5,6 +5,7 @@ Detection runs off the loop: while it works the brain answers bids.
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -21,6 +22,8 @@ from robot_service.failed import SkillFailed
 DETECT_COST_S = 0.06
 JPEG_COST_S = 0.01
 JPEG_QUALITY = 80
+SHOW_EVERY_S = 0.5
+"""People are shown a new picture this often [garden s]."""
 FRESH_S = 3.0
 """A camera that gives no new picture within this time is silent."""
 
@@ -64,6 +67,8 @@ class Eye:
         """What the circles of a `Look` obey."""
         self.accuracy = accuracy or Accuracy()
         self.last: Look | None = None
+        self._shown: tuple[float, bytes] | None = None
+        self._showing = asyncio.Lock()
 
     @property
     def fitted(self) -> bool:
@@ -85,6 +90,15 @@ class Eye:
         found = await self._clock.offload(lambda: self._detect(image), DETECT_COST_S)
         self.last = Look(image=image, detections=tuple(map(self._straight, found)), stamp_s=frame.stamp_s)
         return self.last
+
+    async def show(self) -> bytes:
+        """What the eye sees, fruit ringed, as JPEG; people who ask at about the same time get the same picture."""
+        async with self._showing:
+            if self._shown is None or self._clock.now() - self._shown[0] > SHOW_EVERY_S:
+                recent = self.last is not None and self._clock.now() - self.last.stamp_s < SHOW_EVERY_S
+                look = self.last if recent and self.last is not None else await self.look()
+                self._shown = self._clock.now(), await self._clock.offload(lambda: drawn_jpeg(look), JPEG_COST_S)
+            return self._shown[1]
 
     def _detect(self, image: Image) -> list[Detection]:
         if self._detector is None:

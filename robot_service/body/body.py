@@ -193,16 +193,16 @@ class BodyNode:
             driver.rest(resting)
 
     def _wake(self) -> None:
-        """Somebody wants something: the next turn comes now."""
+        """Somebody wants something: the next turn comes now. When the brain just went, nothing moves from now on."""
+        if not self.brain.connected:
+            self.actuators.halt(self._clock.now())
         if self._resting:
             self._active_s = self._clock.now()
             self._rest(False, self._active_s)
             self._woken.set()
-        elif not self.brain.connected:
-            self._woken.set()
 
     async def _pause(self) -> None:
-        """Until the next turn; a resting body, or one whose brain just went, is woken early."""
+        """Until the next turn; a resting body is woken early."""
         if not self._resting:
             await self._clock.sleep(DT_S)
             return
