@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import random
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -97,10 +98,42 @@ class MemoryMesh:
 
 
 async def _answer(app: Asgi, request: httpx.Request) -> httpx.Response:
-    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
-    response = await transport.handle_async_request(request)
-    await response.aread()
-    return response
+    """The app's whole answer; 500 when it raised before it answered. (ASGI 3.0, HTTP; `httpx.ASGITransport` in short.)"""
+    question: bytes | None = await request.aread()
+    done = asyncio.Event()
+    head: dict[str, Any] = {"status": 500, "headers": []}
+    parts: list[bytes] = []
+
+    async def receive() -> dict[str, Any]:
+        nonlocal question
+        if question is None:
+            await done.wait()
+            return {"type": "http.disconnect"}
+        message = {"type": "http.request", "body": question, "more_body": False}
+        question = None
+        return message
+
+    async def send(message: dict[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            head.update(status=message["status"], headers=list(message.get("headers", [])))
+        elif message["type"] == "http.response.body":
+            parts.append(message.get("body", b""))
+            if not message.get("more_body", False):
+                done.set()
+
+    with contextlib.suppress(Exception):
+        await app(_scope(request), receive, send)
+    return httpx.Response(head["status"], headers=head["headers"], content=b"".join(parts), request=request)
+
+
+def _scope(request: httpx.Request) -> dict[str, Any]:
+    url = request.url
+    return {
+        "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": request.method,
+        "headers": [(name.lower(), value) for name, value in request.headers.raw], "scheme": url.scheme,
+        "path": url.path, "raw_path": url.raw_path.split(b"?")[0], "query_string": url.query,
+        "server": (url.host, url.port), "client": (url.host, 0), "root_path": "",
+    }  # fmt: skip
 
 
 class MemoryTransport(httpx.AsyncBaseTransport):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass
@@ -78,6 +79,8 @@ class Clockwork:
         self._clock: Clock | None = None
         self._anchor_clock_s = self._anchor_garden_s = 0.0
         self._until_s = world.time_s
+        self._due_s = -math.inf
+        """When the first host wants to run, as of the last look at all of them."""
         self._rate = 0.0
         self._window = (0.0, 0.0)
         self._woken = asyncio.Event()
@@ -149,6 +152,7 @@ class Clockwork:
         self._woken.clear()
         if self._paused:
             await self._woken.wait()
+            self._due_s = -math.inf
             self._anchor()
             return
         resting = self._world.at_rest
@@ -175,14 +179,17 @@ class Clockwork:
             self.strides += 1
         else:
             self.ticks += 1
-        now_s = self._world.time_s
-        for host in self._hosts:
-            if host.due_s() <= now_s + 1e-9:
-                host.pump(now_s)
+        self._due_s = min([self._pumped(host, self._world.time_s) for host in self._hosts], default=math.inf)
+
+    def _pumped(self, host: Host, now_s: float) -> float:
+        """Let a host run if it is due; when it wants to run next."""
+        if (due_s := host.due_s()) > now_s + 1e-9:
+            return due_s
+        host.pump(now_s)
+        return host.due_s()
 
     def _stride_s(self) -> float:
-        due_s = min([host.due_s() for host in self._hosts], default=float("inf"))
-        return min(max(due_s - self._world.time_s, STRIDE_S_MIN), STRIDE_S_MAX)
+        return min(max(self._due_s - self._world.time_s, STRIDE_S_MIN), STRIDE_S_MAX)
 
     async def _doze(self, clock: Clock, seconds: float) -> None:
         """Sleeps unless woken."""

@@ -19,8 +19,8 @@ SILENCE_S = 3.0
 SILENCE_RESTING_S = 20.0
 KEEPALIVE_S = 10.0
 """How often a resting device is asked to prove that it is there."""
-LULL_S = 60.0
-"""The same after a long rest."""
+LULL_S = 300.0
+"""The same after a long rest: eleven bytes, each with a gap after it."""
 ACK_S = 1.0
 TRIES = 4
 RANGE_CM_MAX = 1000.0

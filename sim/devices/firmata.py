@@ -118,6 +118,7 @@ class FirmataEmulator:
             return
         if not on:
             self._reporting.discard(channel)
+            self._sample_s = self._sample_s if self._reporting else math.inf
             return
         if not self._reporting:
             self._sample_s = now_s + self._interval_s

@@ -9,10 +9,11 @@ import pytest
 from structlog.testing import capture_logs
 
 from core.errors import ConfigError, DriverTimeout, LinkDown, Refused
-from hw.drivers.firmata import FirmataBoard
+from hw.drivers.firmata import BURST_S, FirmataBoard
 from hw.drivers.probes import _split, open_probe, open_valve
 from sim.devices.bench_firmata import BenchPins
 from sim.devices.firmata import FirmataEmulator
+from sim.devices.outbox import Outbox
 
 Run = Callable[[Callable[[Any], Awaitable[None]]], None]
 TAP = 8
@@ -74,6 +75,56 @@ def test_five_samples_take_a_tenth_of_a_second_and_then_the_wire_is_quiet(in_she
         assert shed.cable.host.due_s() == float("inf")
         await shed.clock.sleep(60.0)
         assert shed.cable.written() == b""
+
+    in_shed(story)
+
+
+def test_a_set_of_samples_is_one_message_each_way(in_shed: Run) -> None:
+    async def story(shed: Shed) -> None:
+        await shed.clock.sleep(0.5)
+        shed.cable.written()
+        before_s = shed.clock.now()
+        assert await shed.probe.sample(5) == pytest.approx((1.44,) * 5, abs=0.05)
+        assert shed.clock.now() - before_s < 0.02
+        assert shed.cable.to_device == [b"\xc0\x01" * 5 + b"\xc0\x00"]
+
+    in_shed(story)
+
+
+class Older(FirmataEmulator):
+    """Before StandardFirmata 2.4: turning a report on sends nothing by itself."""
+
+    def _report_analog(self, channel: int, on: bool, now_s: float) -> None:
+        said = self._out
+        self._out = Outbox()
+        super()._report_analog(channel, on, now_s)
+        self._out = said
+
+
+def test_an_older_firmware_is_listened_to_at_the_sampling_interval(on_cable: Run) -> None:
+    async def main(cable: Any) -> None:
+        shed = Shed(cable)
+        cable.plug(Older(shed.pins, shed.rng))
+        cable.start(shed.board)
+        await shed.board.wait_link()
+        before_s = shed.clock.now()
+        assert await shed.probe.sample(5) == pytest.approx((1.44,) * 5, abs=0.05)
+        assert shed.clock.now() - before_s == pytest.approx(BURST_S + 0.1, abs=0.01)
+        await shed.clock.sleep(0.5)
+        shed.cable.written()
+        await shed.is_well()
+        await cable.stop()
+
+    on_cable(main)
+
+
+def test_many_samples_do_not_overrun_the_boards_buffer(in_shed: Run) -> None:
+    async def story(shed: Shed) -> None:
+        await shed.clock.sleep(0.5)
+        shed.cable.written()
+        assert len(await shed.probe.sample(40)) == 40
+        await shed.clock.sleep(0.1)
+        assert shed.cable.to_device == [b"\xc0\x01", b"\xc0\x00"]
 
     in_shed(story)
 
