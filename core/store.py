@@ -9,6 +9,7 @@ moved aside to `.bad-N`, never deleted. One process writes (flock). Standard lib
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import fcntl
 import hashlib
@@ -120,7 +121,8 @@ class DurableDocument:
     `alarms` says what was found damaged. After a failed fsync nothing is acknowledged any more (`broken` says why).
     """
 
-    def __init__(self, path: Path, schema: str, clock: Clock, disk: Disk | None = None) -> None:
+    def __init__(self, path: Path, schema: str, clock: Clock, disk: Disk | None = None, gather_s: float = 0.0) -> None:
+        """A commit waits `gather_s` at most for those who shared the last one; a lone writer never waits."""
         self.path, self.schema = Path(path), schema
         self.generation = 0
         self.alarms: list[str] = []
@@ -130,6 +132,8 @@ class DurableDocument:
         self._clock, self._disk = clock, disk or Disk()
         self._lock: IO[str] | None = None
         self._queue: list[tuple[Content, asyncio.Future[int]]] = []
+        self._gather_s, self._crowd = gather_s, 1
+        self._crowded = asyncio.Event()
         self._writer: asyncio.Task[None] | None = None
 
     def load(self) -> Any:
@@ -162,6 +166,8 @@ class DurableDocument:
             raise StorageError(f"{self.path.name} is not durable any more: {self.broken}", hint="restart the service")
         done: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self._queue.append((doc, done))
+        if len(self._queue) >= self._crowd:
+            self._crowded.set()
         if self._writer is None:
             self._writer = asyncio.create_task(self._drain())
         return await done
@@ -174,6 +180,7 @@ class DurableDocument:
 
     async def _drain(self) -> None:
         while self._queue:
+            await self._gather()
             batch, self._queue = self._queue, []
             newest = batch[-1][0]
             try:
@@ -184,8 +191,18 @@ class DurableDocument:
                 batch, self._queue = batch + self._queue, []
                 _settle(batch, error)
             else:
+                self._crowd = len(batch) + len(self._queue)
                 _settle(batch, generation)
         self._writer = None
+
+    async def _gather(self) -> None:
+        """Give those who shared the last commit, and have just been answered, the time to come again."""
+        if self._gather_s == 0.0 or len(self._queue) >= self._crowd:
+            return
+        self._crowded.clear()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self._gather_s):
+                await self._crowded.wait()
 
     def commit(self, doc: Content) -> int:
         """The recipe itself, blocking; `save` calls it off the loop. One caller at a time."""

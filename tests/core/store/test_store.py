@@ -81,6 +81,39 @@ def test_concurrent_saves_share_commits_and_each_is_durable_when_answered(tmp_pa
     file.close()
 
 
+def written_by(folder: Path, writers: int, each: int, gather_s: float) -> tuple[int, float]:
+    """Commits and virtual seconds that writers need who write again half a millisecond after their answer."""
+
+    async def main() -> tuple[int, float]:
+        clock = VirtualClock()
+        file = DurableDocument(folder / "doc.json", "test/1", clock, None, gather_s)
+        file.load()
+
+        async def write(first_s: float) -> None:
+            await clock.sleep(first_s)
+            for n in range(each):
+                await file.save({"n": n})
+                await clock.sleep(0.0005)
+
+        began_s = clock.now()
+        await asyncio.gather(*(write(0.0002 * n) for n in range(writers)))
+        file.close()
+        return file.generation, clock.now() - began_s
+
+    return run_virtual(main())
+
+
+def test_writers_who_shared_a_commit_share_the_next_one(tmp_path: Path) -> None:
+    alone, together = written_by(tmp_path / "a", 8, 20, 0.0), written_by(tmp_path / "b", 8, 20, 0.002)
+    assert together[0] <= 20 + 2
+    assert together[0] < 0.6 * alone[0]
+    assert together[1] < alone[1]
+
+
+def test_a_lone_writer_never_waits_for_others(tmp_path: Path) -> None:
+    assert written_by(tmp_path / "a", 1, 20, 0.5) == written_by(tmp_path / "b", 1, 20, 0.0)
+
+
 def test_any_damaged_byte_is_noticed_and_the_older_copy_used(tmp_path: Path) -> None:
     seed = 2026
     print("seed", seed)
