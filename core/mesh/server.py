@@ -35,6 +35,31 @@ _NOT_PLAIN = re.compile(
     re.IGNORECASE,
 )
 """Headers that may change the answer, or what comes after it."""
+SEND_BUFFER_BYTES = 256 * 1024
+"""A whole inventory leaves in one piece."""
+
+
+class ReadyAnswer:
+    """The bytes of an answer, head and body, put together anew only when the answer or the date has changed."""
+
+    __slots__ = ("_bytes", "_defaults", "_make", "_response")
+
+    def __init__(self, make: Callable[[], Response]) -> None:
+        self._make = make
+        self._response: Response | None = None
+        self._defaults: list[tuple[bytes, bytes]] = []
+        self._bytes = b""
+
+    def encoded(self, defaults: list[tuple[bytes, bytes]]) -> bytes:
+        """`defaults` are headers that every answer carries; a new list when one of them is new."""
+        response = self._make()
+        if response is not self._response or defaults is not self._defaults:
+            head = [b"HTTP/1.1 %d OK\r\n" % response.status_code]
+            for name, value in (*defaults, *response.raw_headers):
+                head += (name, b": ", value, b"\r\n")
+            self._bytes = b"".join((*head, b"\r\n", response.body))
+            self._response, self._defaults = response, defaults
+        return self._bytes
 
 
 class ImpatientProtocol(HttpToolsProtocol):
@@ -45,6 +70,10 @@ class ImpatientProtocol(HttpToolsProtocol):
     _in_head = True
     _whole = True
     """Nothing of a request has come that is not complete."""
+    _plain = b""
+    _ready: ReadyAnswer | None = None
+    """The last plain GET, byte for byte, and what answers it."""
+    _answered_s = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -87,24 +116,36 @@ class ImpatientProtocol(HttpToolsProtocol):
     def send_400_response(self, msg: str) -> None:
         self._say_and_close(b"400 Bad Request", _BROKEN)
 
+    def timeout_keep_alive_handler(self) -> None:
+        """uvicorn's word for a connection that was idle too long; our own answers only note the time they were given."""
+        left_s = self._answered_s + self.timeout_keep_alive - self.loop.time()
+        if left_s > 0:
+            self.timeout_keep_alive_task = self.loop.call_later(left_s, self.timeout_keep_alive_handler)
+        else:
+            super().timeout_keep_alive_handler()
+
     def _answered_at_once(self, data: bytes) -> bool:
         """True when this was a whole, plain GET of a path that has ready bytes, and the answer is written."""
-        ready: dict[bytes, Callable[[], Response]] = self.config.ready  # type: ignore[attr-defined]
-        if not ready or (self.cycle is not None and not self.cycle.response_complete) or self.pipeline:
+        if (self.cycle is not None and not self.cycle.response_complete) or self.pipeline:
             return False
-        plain = _PLAIN_GET.match(data)
-        make = ready.get(plain[1]) if plain else None
-        if make is None or data.find(b"\r\n\r\n") != len(data) - 4 or _NOT_PLAIN.search(data):
+        if data != self._plain:
+            self._plain, self._ready = data, self._ready_for(data)
+        if self._ready is None:
             return False
         self._forget()
-        self._unset_keepalive_if_required()
-        response = make()
-        head = [b"HTTP/1.1 %d OK\r\n" % response.status_code]
-        for name, value in (*self.server_state.default_headers, *response.raw_headers):
-            head += (name, b": ", value, b"\r\n")
-        self.transport.write(b"".join((*head, b"\r\n", response.body)))
-        self.timeout_keep_alive_task = self.loop.call_later(self.timeout_keep_alive, self.timeout_keep_alive_handler)
+        self._answered_s = self.loop.time()
+        if self.timeout_keep_alive_task is None:
+            left_s = self.timeout_keep_alive
+            self.timeout_keep_alive_task = self.loop.call_later(left_s, self.timeout_keep_alive_handler)
+        self.transport.write_at_once(self._ready.encoded(self.server_state.default_headers))  # type: ignore[attr-defined]
         return True
+
+    def _ready_for(self, data: bytes) -> ReadyAnswer | None:
+        plain = _PLAIN_GET.match(data)
+        ready: ReadyAnswer | None = self.config.ready.get(plain[1]) if plain else None  # type: ignore[attr-defined]
+        if ready is None or data.find(b"\r\n\r\n") != len(data) - 4 or _NOT_PLAIN.search(data):
+            return None
+        return ready
 
     def _too_slow(self) -> None:
         self._deadline = None
@@ -139,6 +180,10 @@ class _Corked:
         if not self._parts:
             self._loop.call_soon(self._flush)
         self._parts.append(data)
+
+    def write_at_once(self, data: bytes) -> None:
+        self._flush()
+        self._inner.write(data)
 
     def close(self) -> None:
         self._flush()
@@ -180,7 +225,7 @@ def make_server(app: FastAPI) -> Server:
         timeout_keep_alive=30,
         timeout_graceful_shutdown=1,
     )
-    config.ready = app.state.ready_bytes  # type: ignore[attr-defined]
+    config.ready = {path: ReadyAnswer(make) for path, make in app.state.ready_bytes.items()}  # type: ignore[attr-defined]
     return Server(config)
 
 
@@ -191,6 +236,7 @@ def listen(host: str, port: int) -> socket.socket:
     sock = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         sock.bind((host, port))
     except OSError as error:
         sock.close()
