@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from fastapi import FastAPI, Header, Path, Query
-from fastapi.routing import APIRoute
 from starlette.responses import PlainTextResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from core.errors import Forbidden
 from core.history import as_csv
 from core.mesh.auth import Caller
-from core.mesh.chassis import allow, body, serve_ready
+from core.mesh.chassis import allow, body, serve_direct, serve_ready
+from core.mesh.guard import header
 from core.wire.documents import HistoryEntry
 from core.wire.fruit import Colour, Fruit, Inventory, NewFruit, Scan
 from core.wire.market import (
@@ -34,10 +34,8 @@ from core.wire.plant import (
     TapGrant,
     TapRequest,
 )
-from plant_service.inventory import etag
 from plant_service.journal import Journal
 from plant_service.pot import Pot
-from plant_service.shelf import Shelf
 from plant_service.station import Station
 
 Id = Annotated[str, Path(max_length=80)]
@@ -98,21 +96,14 @@ def _inventory_routes(app: FastAPI, pot: Pot) -> None:
     ) -> Response:
         return pot.shelf.answer(colour, if_none_match)
 
-    @app.post("/inventory/fruits", tags=["inventory"], summary="Add one fruit", status_code=201)
-    async def add(
-        response: Response, caller: Caller = allow("robot", "operator"), fruit: NewFruit = body(NewFruit)
-    ) -> Fruit:
-        added, now = await pot.shelf.add(fruit)
-        response.headers["location"] = f"/inventory/fruits/{added.fruit_id}"
-        response.headers["etag"] = now
-        return added
+    @app.post("/inventory/fruits", tags=["inventory"], summary="Add one fruit", status_code=201, response_model=Fruit)
+    async def add(caller: Caller = allow("robot", "operator"), fruit: NewFruit = body(NewFruit)) -> Response:
+        return await pot.shelf.add(fruit)
 
-    @app.post("/inventory/scans", tags=["inventory"], summary="Merge what a scan saw")
-    async def scan(response: Response, caller: Caller = allow("robot", "operator"), seen: Scan = body(Scan)) -> Inventory:
+    @app.post("/inventory/scans", tags=["inventory"], summary="Merge what a scan saw", response_model=Inventory)
+    async def scan(caller: Caller = allow("robot", "operator"), seen: Scan = body(Scan)) -> Response:
         speaks_for(caller, seen.robot_id or caller.subject)
-        merged = await pot.shelf.merge(seen)
-        response.headers["etag"] = etag(merged)
-        return merged
+        return await pot.shelf.merge(seen)
 
     @app.delete("/inventory/fruits/{fruit_id}", tags=["inventory"], summary="A fruit is gone", status_code=204)
     async def remove(
@@ -123,26 +114,14 @@ def _inventory_routes(app: FastAPI, pot: Pot) -> None:
         now = await pot.shelf.remove(fruit_id, if_match)
         return Response(status_code=204, headers={"etag": now})
 
-    _shortcut(app, pot.shelf)
-    serve_ready(app, "/inventory", lambda: pot.shelf.answer(None, ""))
+    async def whole(scope: Scope, receive: Receive, send: Send) -> None:
+        known = header(scope["headers"], b"if-none-match")[:200]
+        await pot.shelf.answer(None, known)(scope, receive, send)
 
-
-def _shortcut(app: FastAPI, shelf: Shelf) -> None:
-    """The whole inventory is read most: its ready bytes go past the handling of parameters, and it is looked up first."""
-    routes = app.router.routes
-    route = next(r for r in routes if isinstance(r, APIRoute) and r.path == "/inventory")
-    careful = route.app
-
-    async def fast(scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["query_string"]:
-            await careful(scope, receive, send)
-            return
-        known = next((value for name, value in scope["headers"] if name == b"if-none-match"), b"")
-        await shelf.answer(None, known[:200].decode("latin-1"))(scope, receive, send)
-
-    route.app = fast
-    routes.remove(route)
-    routes.insert(0, route)
+    serve_direct(app, "GET", "/inventory", whole)
+    serve_direct(app, "POST", "/inventory/fruits")
+    serve_direct(app, "POST", "/inventory/scans")
+    serve_ready(app, "/inventory", pot.shelf.whole)
 
 
 def _task_routes(app: FastAPI, pot: Pot) -> None:

@@ -22,12 +22,22 @@ D = TypeVar("D", bound=Document)
 T = TypeVar("T")
 
 
+def _dump(document: Document) -> bytes:
+    return document.model_dump_json().encode()
+
+
 class Keeper(Generic[M, D]):
     """Runs events on a machine and saves it. A failed save takes the machine back to its last durable document."""
 
-    def __init__(self, file: DurableDocument, model: type[D], revive: Callable[[D | None], M]) -> None:
-        """Reads the file; `revive` makes the machine from its document. Raises StorageError."""
-        self._file, self._revive = file, revive
+    def __init__(
+        self,
+        file: DurableDocument,
+        model: type[D],
+        revive: Callable[[D | None], M],
+        encode: Callable[[D], bytes] = _dump,
+    ) -> None:
+        """Reads the file; `revive` makes the machine of a document, `encode` its JSON, off the loop. Raises StorageError."""
+        self._file, self._revive, self._encode = file, revive, encode
         stored = file.load()
         self.durable: D | None = None if stored is None else model.model_validate(stored)
         self._machine = revive(self.durable)
@@ -60,7 +70,7 @@ class Keeper(Generic[M, D]):
         document: D = machine.document()
         self._saving += 1
         try:
-            await self._file.save(lambda: document.model_dump_json().encode())
+            await self._file.save(lambda: self._encode(document))
         finally:
             self._saving -= 1
         self.durable = document

@@ -29,7 +29,10 @@ from plant_service.pot import Care, Pot
 from plant_service.settings import PlantSettings
 from plant_service.shelf import Shelf
 from plant_service.station import Meter, Station, TapDocument
+from plant_service.texts import FruitTexts
 
+GATHER_S = 0.002
+"""Those who write many fruits at once share their commits."""
 Loop = Callable[[], Awaitable[None]]
 
 
@@ -75,8 +78,8 @@ class _Parts:
         self.settings, self.clock, self.opener, self.mesh = settings, clock, opener, mesh
         self.verifier, self.peers, self.journal, self.open_reads, self.disk = verifier, peers, journal, open_reads, disk
 
-    def file(self, name: str) -> DurableDocument:
-        return DurableDocument(self.settings.folder / f"{name}.json", f"{name}/1", self.clock, self.disk)
+    def file(self, name: str, gather_s: float = 0.0) -> DurableDocument:
+        return DurableDocument(self.settings.folder / f"{name}.json", f"{name}/1", self.clock, self.disk, gather_s)
 
     def docks(self, dock_ids: list[str]) -> Keeper[Docks, DocksDocument]:
         owner, clock = self.settings.id, self.clock
@@ -88,12 +91,14 @@ def build_pot(parts: _Parts) -> Node:
     limits = Limits()
     card, base = settings.card(), settings.care()
     market = Keeper(parts.file("market"), MarketDocument, lambda doc: Market(card, doc, clock.now(), limits=limits))
-    fruits = Keeper(parts.file("inventory"), InventoryDocument, lambda doc: Fruits(settings.id, doc))
+    texts = FruitTexts()
+    stored = parts.file("inventory", GATHER_S)
+    fruits = Keeper(stored, InventoryDocument, lambda doc: Fruits(settings.id, doc), texts.stored)
     care = Keeper(parts.file("settings"), SettingsPatch, lambda doc: Care(base, doc))
     docks = parts.docks([settings.id])
     probe = open_probe(settings.probe_url, parts.opener, clock)
     place = Marketplace(market, parts.mesh, parts.peers, clock, journal)
-    pot = Pot(settings, clock, probe, place, docks, Shelf(fruits, clock), care, journal)
+    pot = Pot(settings, clock, probe, place, docks, Shelf(fruits, clock, texts), care, journal)
     keepers = (market, fruits, care, docks)
     _tell_alarms(keepers, journal)
     app = create_app(

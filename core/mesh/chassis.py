@@ -13,11 +13,13 @@ from fastapi.responses import HTMLResponse, StreamingResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from core.clock import Clock
 from core.errors import Forbidden, GardenError, Unavailable
 from core.mesh.auth import ANYBODY, ROLES, Caller, Verifier
 from core.mesh.describe import describe, docs_page
+from core.mesh.direct import route_of, run_directly
 from core.mesh.events import EventLog
 from core.mesh.guard import Guard, bearer, request_counter
 from core.mesh.problems import problem_response
@@ -26,7 +28,7 @@ from core.wire.documents import Document, HistoryEntry, NodeCard
 
 SSE_SILENCE_S = 15.0
 
-__all__ = ["Allow", "allow", "body", "create_app", "parse", "serve_ready", "version"]
+__all__ = ["Allow", "allow", "body", "create_app", "parse", "serve_direct", "serve_ready", "version"]
 
 
 class Health(Document):
@@ -49,13 +51,18 @@ class Allow:
         self.roles = roles
 
     async def __call__(self, request: Request) -> Caller:
-        state = request.app.state
-        verifier: Verifier | None = state.verifier
-        caller = ANYBODY
-        if verifier is not None:
-            caller = verifier.verify(bearer(request.scope["headers"]), state.clock.now())
-            self._check(caller)
+        caller = self.caller(request.scope)
         await no_surplus(request)
+        return caller
+
+    def caller(self, scope: Scope) -> Caller:
+        """Who asks; raises Unauthorised or Forbidden."""
+        state = scope["app"].state
+        verifier: Verifier | None = state.verifier
+        if verifier is None:
+            return ANYBODY
+        caller = verifier.verify(bearer(scope["headers"]), state.clock.now())
+        self._check(caller)
         return caller
 
     def _check(self, caller: Caller) -> None:
@@ -99,6 +106,7 @@ def create_app(
         dependencies=[Depends(plain_read)],
     )
     registry = registry if registry is not None else CollectorRegistry()
+    app.state.direct = {}
     app.state.open_reads, app.state.ready_bytes, app.state.requests = open_reads, {}, request_counter(registry)
     app.state.clock, app.state.verifier, app.state.events, app.state.registry = clock, verifier, events, registry
     app.add_middleware(
@@ -109,6 +117,7 @@ def create_app(
         registry=registry,
         body_bytes_max=body_bytes_max,
         open_reads=open_reads,
+        direct=app.state.direct,
     )
     _refusals(app)
     _plain_routes(app, card, ready, registry, page)
@@ -132,6 +141,22 @@ def serve_ready(app: FastAPI, path: str, make: Callable[[], Response]) -> None:
 
     if app.state.open_reads:
         app.state.ready_bytes[path.encode()] = counted
+
+
+def serve_direct(app: FastAPI, method: str, path: str, handler: ASGIApp | None = None) -> None:
+    """Let requests without a query reach a route past FastAPI, which goes on to describe it and to answer all others.
+
+    `handler` answers instead of the endpoint; without one the endpoint does, as `run_directly` has it (LookupError and
+    ValueError as there).
+    """
+    route = route_of(app, method, path)
+    run = handler or run_directly(route)
+
+    async def direct(scope: Scope, receive: Receive, send: Send) -> None:
+        scope["route"] = route
+        await run(scope, receive, send)
+
+    app.state.direct[method, path] = direct
 
 
 def _refusals(app: FastAPI) -> None:

@@ -1,0 +1,37 @@
+"""The inventory as JSON: a fruit that has not changed is not encoded again."""
+
+from __future__ import annotations
+
+from core.wire.fruit import Fruit, Inventory
+from plant_service.inventory import InventoryDocument
+
+
+class FruitTexts:
+    """Knows the JSON of the fruits it saw last, by object: documents are frozen. May be asked from several threads."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[Fruit, bytes]] = {}
+        self._last: tuple[Inventory | None, bytes] = (None, b"")
+
+    def inventory(self, inventory: Inventory) -> bytes:
+        """What is not known of a fruit (null) is left out: it is the same document."""
+        last, text = self._last
+        if last is not inventory:
+            text = self._encode(inventory)
+            self._last = inventory, text
+        return text
+
+    def stored(self, document: InventoryDocument) -> bytes:
+        """The whole document as it is kept on disk."""
+        rest = document.model_dump_json(exclude={"inventory"}).encode()
+        return b'{"inventory":' + self.inventory(document.inventory) + b"," + rest[1:]
+
+    def _encode(self, inventory: Inventory) -> bytes:
+        known, seen = self._known, {}
+        for fruit in inventory.fruits:
+            before = known.get(id(fruit))
+            # The entry holds the fruit, so that no other can have its number while we know it.
+            seen[id(fruit)] = before or (fruit, fruit.model_dump_json(exclude_none=True).encode())
+        self._known = seen
+        head = inventory.model_dump_json(exclude={"fruits"}).encode()
+        return head[:-1] + b',"fruits":[' + b",".join([text for _, text in seen.values()]) + b"]}"
