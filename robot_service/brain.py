@@ -67,7 +67,7 @@ class Brain:
         self.robot = Robot(
             settings, clock, rng, self.body, where, Ground(settings.map), neighbours, mesh, peers, self.events, eye
         )
-        self.docks = Docks(settings.id, mesh, peers, clock)
+        self.docks = Docks(settings.id, mesh, peers, clock, neighbours.calm)
         self.queue = TaskQueue()
         self.reporter = Reporter(self.robot, self.queue)
         planner = Planner(self.robot, self.docks, self.travel_s)

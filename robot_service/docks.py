@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from core.clock import Clock
@@ -15,6 +16,10 @@ from core.wire.market import Reservation, ReservationRequest
 
 HOLD_FOR_S = 30.0
 RENEW_S = 8.0
+REST_FOR_S = 60.0
+"""Who only rests on a dock holds it longer and asks less often: should it die there, it blocks the dock anyway."""
+RENEW_RESTING_S = 24.0
+"""Renewing tells us that somebody waits, and nobody can while all neighbours stand still."""
 
 
 @dataclass(slots=True)
@@ -39,6 +44,8 @@ class Docks:
     mesh: Mesh
     peers: Peers
     clock: Clock
+    calm: Callable[[], bool] = lambda: False
+    """No neighbour moves, as far as we have heard."""
     holds: dict[str, Hold] = field(default_factory=dict)
     _news: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -56,7 +63,8 @@ class Docks:
         owner = self.peers.find(dock.owner)
         if owner is None:
             return f"nobody known owns dock {dock.name}"
-        wish = ReservationRequest(robot_id=self.me, dock_id=dock.dock_id, for_s=HOLD_FOR_S, yielding=yielding)
+        for_s = REST_FOR_S if yielding else HOLD_FOR_S
+        wish = ReservationRequest(robot_id=self.me, dock_id=dock.dock_id, for_s=for_s, yielding=yielding)
         asked_s = self.clock.now()
         try:
             granted = await self.mesh.call(owner, "POST", "/dock/reservations", wish, expect=Reservation)
@@ -104,8 +112,13 @@ class Docks:
         while True:
             await self.clock.sleep(RENEW_S)
             for hold in list(self.holds.values()):
-                if self.holds.get(hold.dock.name) is hold:
+                if self.holds.get(hold.dock.name) is hold and not self._may_wait(hold):
                     await self.ask(hold.dock, yielding=hold.yielding)
+
+    def _may_wait(self, hold: Hold) -> bool:
+        """A rest that nobody can want to end is renewed seldom, yet with time for a second and a third attempt."""
+        left_s = hold.until_s - self.clock.now()
+        return hold.yielding and not hold.lost and left_s > REST_FOR_S - RENEW_RESTING_S + 1.0 and self.calm()
 
 
 class Nothing(Document):

@@ -95,9 +95,13 @@ class Neighbours:
         except TimeoutError:
             pass
 
+    def calm(self) -> bool:
+        """Nobody moves, as far as we have heard."""
+        return not any(heard.position.moving for heard in self.heard.values())
+
     def _every_s(self) -> float:
         mine = self.moving()
-        if not mine and not any(heard.position.moving for heard in self.heard.values()):
+        if not mine and self.calm():
             return IDLE_EVERY_S if self.idle() else STILL_EVERY_S
         pose = self.pose()
         near = pose is not None and any(
