@@ -190,8 +190,8 @@ class Forecast(Document):
     level: Ratio = 0.9
     uncertainty: Ratio = 1.0
     """Of the inventory: 0 just scanned, 1 nothing known."""
-    ripening_per_day: float = 0.0
-    """Of this plant: the rise of the ripeness' log-odds a day."""
+    turning_days: Annotated[float, Field(ge=0, le=100)] = 5.0
+    """From the first tinge to red, as this plant has learnt it from its own fruit."""
     fruits: list[FruitForecast] = []
 
 
