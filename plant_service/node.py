@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from random import Random
-
-import httpx
+from typing import TYPE_CHECKING
 
 from core.allocation.docks import Docks, DocksDocument
 from core.allocation.plant_side import Market
@@ -30,6 +29,9 @@ from plant_service.settings import PlantSettings
 from plant_service.shelf import Shelf
 from plant_service.station import Meter, Station, TapDocument
 from plant_service.texts import FruitTexts
+
+if TYPE_CHECKING:
+    import httpx
 
 GATHER_S = 0.002
 """Those who write many fruits at once share their commits."""
