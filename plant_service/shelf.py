@@ -42,13 +42,13 @@ class Shelf:
             return whole
         fruits = [fruit for fruit in self._shown.fruits if fruit.colour == colour]
         part = self._shown.model_copy(update={"fruits": fruits})
-        return Response(part.model_dump_json(), headers={"etag": etag(part)}, media_type=JSON)
+        return Response(part.model_dump_json(exclude_none=True), headers={"etag": etag(part)}, media_type=JSON)
 
     async def add(self, fruit: NewFruit) -> Response:
         """The new fruit, where it is, and the ETag after it."""
         added, now = await self._keeper.change(lambda fruits: (fruits.add(fruit, self._clock.now()), etag(fruits.inventory)))
         headers = {"location": f"/inventory/fruits/{added.fruit_id}", "etag": now}
-        return Response(added.model_dump_json(), 201, headers, media_type=JSON)
+        return Response(added.model_dump_json(exclude_none=True), 201, headers, media_type=JSON)
 
     async def merge(self, scan: Scan) -> Response:
         """The inventory with what the scan saw."""

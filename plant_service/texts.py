@@ -14,7 +14,7 @@ class FruitTexts:
         self._last: tuple[Inventory | None, bytes] = (None, b"")
 
     def inventory(self, inventory: Inventory) -> bytes:
-        """What is not known of a fruit (null) is left out: it is the same document."""
+        """What is not known (null) is left out: it is the same document."""
         last, text = self._last
         if last is not inventory:
             text = self._encode(inventory)
@@ -33,5 +33,5 @@ class FruitTexts:
             # The entry holds the fruit, so that no other can have its number while we know it.
             seen[id(fruit)] = before or (fruit, fruit.model_dump_json(exclude_none=True).encode())
         self._known = seen
-        head = inventory.model_dump_json(exclude={"fruits"}).encode()
+        head = inventory.model_dump_json(exclude={"fruits"}, exclude_none=True).encode()
         return head[:-1] + b',"fruits":[' + b",".join([text for _, text in seen.values()]) + b"]}"
