@@ -17,8 +17,11 @@ from lab.quiet import hush
 from lab.results import Result
 
 EXPERIMENTS = {
+    "detector": "lab.experiments.detector:detector_experiment",
     "square-loop": "lab.experiments.square_loop:square_loop",
     "watering": "lab.experiments.watering:watering",
+    "inventory": "lab.experiments.inventory:inventory",
+    "grasp": "lab.experiments.grasp:grasp",
 }
 """Each is a function (trials, seed, with_, progress) -> Result."""
 

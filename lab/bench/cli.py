@@ -20,6 +20,7 @@ BENCHES = {
     "wavefront": "lab.bench.wavefront:bench_wavefront",
     "pot": "lab.bench.pot:bench_pot",
     "broadcast": "lab.bench.broadcast:bench_broadcast",
+    "detector": "lab.bench.detector:bench_detector",
 }
 """Each is a function (n) -> rows {name, ours, peer, ratio, unit, n}; a row may carry target and ok."""
 

@@ -1,7 +1,7 @@
 """Labelled images: `labels.json` beside `images/`, split by what they show.
 
-`labels.json` is `[{"file", "width", "height", "boxes": [{"x", "y", "w", "h", "label", "difficult"?, "visible_ratio"?}],
-"group"?}]`, pixels, origin top left. Rendered frames carry `visible_ratio`, and a `group` (their world's seed).
+`labels.json` is `[{"file", "width", "height", "boxes": [{"x", "y", "w", "h", "label", "difficult"?, "ambiguous"?,
+"visible_ratio"?}], "group"?}]`, pixels, origin top left. Rendered frames carry `visible_ratio` and a `group`.
 """
 
 from __future__ import annotations
@@ -170,9 +170,8 @@ def grouped(photographs: Sequence[Photograph]) -> tuple[Photograph, ...]:
     """
     known = _known_groups()
     names = [_name(p) for p in photographs]
-    if all(name in known for name in names):
-        return tuple(replace(p, group=known[name]) for p, name in zip(photographs, names, strict=True))
-    return compared(photographs)
+    old = [replace(p, group=known[name]) for p, name in zip(photographs, names, strict=True) if name in known]
+    return (*old, *compared([p for p, name in zip(photographs, names, strict=True) if name not in known]))
 
 
 def _known_groups() -> dict[str, str]:
@@ -193,14 +192,20 @@ def compared(photographs: Sequence[Photograph]) -> tuple[Photograph, ...]:
             k = parent[k]
         return k
 
-    corners = [_corners(p.image()) for p in photographs]
+    corners = [(np.zeros((0, 2)), None) if _came_with_group(p) else _corners(p.image()) for p in photographs]
     for a, b in combinations(range(len(photographs)), 2):
         one, other = photographs[a], photographs[b]
         if root(a) == root(b) or one.path.parent != other.path.parent:
             continue
+        if one.group != other.group and _came_with_group(one) and _came_with_group(other):
+            continue
         if one.group == other.group or _neighbours(one.path, other.path) or _overlap(corners[a], corners[b]):
             parent[root(b)] = root(a)
     return tuple(replace(p, group=photographs[root(k)].group) for k, p in enumerate(photographs))
+
+
+def _came_with_group(photograph: Photograph) -> bool:
+    return not photograph.group.endswith(photograph.path.name)
 
 
 def _neighbours(one: Path, other: Path) -> bool:

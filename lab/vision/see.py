@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -16,7 +16,10 @@ from rich.console import Console
 from core.errors import ConfigError
 from core.perception.detection import Detection, Image
 from core.perception.registry import DETECTORS, detector
+from lab.reproduce import load_object
 
+STAGES = {"filter": "core.perception.filters:stages"}
+"""Detectors that can be looked into: a function (image) -> pictures by name, (h, w, 3) uint8 or maps (h, w) of 0..1."""
 INK = {"red": (40, 40, 255), "turning": (0, 190, 255), "green": (60, 255, 60)}
 
 
@@ -33,6 +36,20 @@ def drawn(image: Image, detections: Sequence[Detection]) -> Image:
             out, text, (centre[0] - 12, centre[1] + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (255, 255, 255), 1, cv2.LINE_AA
         )
     return out
+
+
+def write_stages(folder: Path, image: Image, found: Sequence[Detection], spec: str | None) -> None:
+    """A numbered picture of each stage, brightest where a map is largest, and the detections last."""
+    folder.mkdir(parents=True, exist_ok=True)
+    maps: dict[str, Any] = load_object(spec)(image) if spec else {}
+    for index, (name, stage) in enumerate(maps.items()):
+        save(folder / f"{index:02d}-{name}.png", stage if stage.dtype == np.uint8 else _heat(stage))
+    save(folder / f"{len(maps):02d}-detections.png", drawn(image, found))
+
+
+def _heat(stage: Any) -> Image:
+    shade = np.clip(np.asarray(stage) * 255, 0, 255).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(shade, cv2.COLORMAP_INFERNO), np.uint8)
 
 
 def read_image(path: Path) -> Image:
@@ -62,8 +79,7 @@ def see_command(
         pixels = read_image(image)
         found = detector(own or which)(pixels)
         if stages is not None:
-            stages.mkdir(parents=True, exist_ok=True)
-            save(stages / "detections.png", drawn(pixels, found))
+            write_stages(stages, pixels, found, None if own else STAGES.get(which))
     except ConfigError as error:
         tell.print(f"{error} ({error.hint})", markup=False)
         raise typer.Exit(2) from error

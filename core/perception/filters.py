@@ -1,0 +1,341 @@
+"""The paper's filter detector: each filter a map of its own, combined with weights (paper 000, section 4.2, figure 8).
+
+White balance first, so that a purple lamp does not paint the plant. Then Algorithm 1's filters: smoothness (Sobel), red and
+green colour planes, blobs between a least and a largest area, Hough circles, spectral highlights. Where the circles and the
+colour agree a fruit may be; the weighted sum of what every filter says there decides. The gains of the paper were tuned by
+hand; these are fitted by `garden train filter` from labelled images (`filters.json`).
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.resources
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.perception import filter_kernels as kernels
+from core.perception.detection import Colour, Detection, Detector, Image
+
+Floats: TypeAlias = NDArray[np.float32]
+
+WEIGHTS = "filters.json"
+LONG_SIDE_PX = 400
+"""Images are brought to this size first."""
+BINS = 32
+"""Of each channel in the colour table."""
+BRIGHTNESS = 0.42
+"""What the balanced image's generalised mean is brought to, 1 being white."""
+GAIN_RANGE = (0.4, 4.0)
+BGR_LUMA = (0.114, 0.587, 0.299)
+SOBEL_SOFT = 0.35
+"""Brightness step over a Sobel window at which smoothness has fallen to 1/e."""
+BLOB_FROM = 0.35
+"""Colour times smoothness above which a pixel belongs to a blob."""
+AREA_MIN, AREA_MAX = 2e-4, 0.25
+"""Of a blob, as shares of the image."""
+HIGHLIGHT_STEP = 0.10
+"""A highlight is this much brighter than its surroundings."""
+STEEP = 0.10
+"""Least slope of a vote's pixel."""
+RADII_PX = (4, 8)
+"""Of the circles voted for at each pyramid level; a level has half the size of the one before."""
+LEVELS = 5
+VOTE_MIN = 0.30
+"""Circle votes plus colour at a centre below which it is not looked at."""
+CANDIDATES_MAX = 70
+"""A pyramid level and colour."""
+APART = 0.75
+"""Of the larger radius: nearer centres are one fruit."""
+SURE_ENOUGH = 0.5
+
+FAMILIES: tuple[Colour, Colour] = ("red", "green")
+MAPS = ("red", "green", "brightness", "whiteness", "smooth", "area", "highlight")
+FEATURES = (
+    "colour",
+    "colour_middle",
+    "colour_around",
+    "other_colour",
+    "smooth",
+    "smooth_around",
+    "area",
+    "circle",
+    "edge_seen",
+    "edge_step",
+    "highlight",
+    "brightness",
+    "brighter_than_around",
+    "whiteness",
+    "log_radius",
+)
+"""What the filters say of a candidate, in the order of the weights."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weights:
+    """What `garden train filter` fits."""
+
+    balance_norm: float
+    """Of the generalised mean that is made grey: 1 is the mean, large ones look at the brightest."""
+    colour: NDArray[np.float64]
+    """(2, len(colour_terms)): log odds of red and of green fruit against everything else."""
+    candidate: NDArray[np.float64]
+    """(2, 1 + terms): a family's bias and gains over `terms` of the normalised features."""
+    centre: NDArray[np.float64]
+    """(2, FEATURES): features' means."""
+    spread: NDArray[np.float64]
+    """(2, FEATURES): features' deviations."""
+    ripe: NDArray[np.float64]
+    """(3,): log odds of red against turning: bias, and gains of log red/green and log blue/green in the fruit's middle."""
+    sure: NDArray[np.float64]
+    """(2,): the confidence from which a candidate of the family is a fruit."""
+
+    def document(self) -> dict[str, Any]:
+        """As JSON, rounded."""
+        return {name: np.round(getattr(self, name), 5).tolist() for name in Weights.__slots__}
+
+    @classmethod
+    def of(cls, document: dict[str, Any]) -> Weights:
+        """From JSON; raises KeyError when a part is missing."""
+        arrays = {name: np.array(document[name], float) for name in cls.__slots__ if name != "balance_norm"}
+        return cls(balance_norm=float(document["balance_norm"]), **arrays)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Places where a fruit may be: circles (n, 3) [px of the full image], what the filters say (n, FEATURES)."""
+
+    family: int
+    circles: Floats
+    features: Floats
+
+
+def filter_detector() -> Detector:
+    """The detector with its packaged weights; raises FileNotFoundError without them."""
+    return with_weights(packaged())
+
+
+@functools.cache
+def packaged() -> Weights:
+    """The weights beside this file."""
+    return Weights.of(json.loads(importlib.resources.files("core.perception").joinpath(WEIGHTS).read_text()))
+
+
+def with_weights(weights: Weights) -> Detector:
+    """A detector by its weights."""
+    table = colour_table(weights.colour)
+    return lambda image: detect(image, weights, table)
+
+
+def detect(image: Image, weights: Weights, table: Floats) -> list[Detection]:
+    """Fruit in an image (H, W, 3) BGR uint8 of any size, the surest first. `table` is `colour_table(weights.colour)`."""
+    seen = Seen(image, weights.balance_norm, table)
+    circles, families, confidence = _judged(list(seen.candidates()), weights)
+    order = np.argsort(-confidence)
+    kept = order[kernels.distinct(circles[order], APART)]
+    return [_detection(seen, circles[k], int(families[k]), float(confidence[k]), weights) for k in kept]
+
+
+def stages(image: Image) -> dict[str, Image | Floats]:
+    """Everything on the way to `filter_detector`'s answer, at the working size: the balanced image (h, w, 3) uint8, then
+    each filter's map (h, w), 0..1, each colour's circle votes, and the weighted sum, drawn where it was asked."""
+    weights = packaged()
+    seen = Seen(image, weights.balance_norm, colour_table(weights.colour))
+    pictures: dict[str, Image | Floats] = {"balanced": np.clip(seen.image * seen.gains, 0, 255).astype(np.uint8)}
+    pictures |= {name: seen.maps[MAPS.index(name)].copy() for name in ("smooth", "red", "green", "highlight")}
+    pictures |= {f"area_{FAMILIES[k]}": seen.areas[k] for k in range(len(FAMILIES))}
+    for k, name in enumerate(FAMILIES):
+        pictures[f"circles_{name}"] = np.minimum(circle_votes(seen.maps, k)[1], 1)
+        pictures[f"combined_{name}"] = np.zeros(seen.image.shape[:2], np.float32)
+    for each in seen.candidates():
+        drawn_on = f"combined_{FAMILIES[each.family]}"
+        confidence = confidence_of(each, weights)
+        for k in np.argsort(confidence):
+            u, v, radius = (round(float(value)) for value in each.circles[k] * seen.scale)
+            drawn = cv2.circle(np.zeros_like(pictures[drawn_on]), (u, v), max(radius, 1), float(confidence[k]), -1)
+            pictures[drawn_on] = np.maximum(pictures[drawn_on], np.asarray(drawn, np.float32))
+    return pictures
+
+
+def warm() -> None:
+    """Compile the kernels into numba's cache, so that nobody's first picture waits for them."""
+    seen = Seen(np.full((240, 320, 3), 90, np.uint8), 1.0, np.zeros((BINS**3, 2), np.float32))
+    found = list(seen.candidates())
+    kernels.distinct(np.concatenate([each.circles for each in found]), APART)
+
+
+def _judged(candidates: list[Candidates], weights: Weights) -> tuple[Floats, NDArray[np.int64], NDArray[np.float64]]:
+    """Circles, families and confidences of the candidates that are sure enough."""
+    circles, families, confidences = [np.zeros((0, 3), np.float32)], [np.zeros(0, np.int64)], [np.zeros(0)]
+    for each in candidates:
+        confidence = confidence_of(each, weights)
+        sure = confidence >= weights.sure[each.family]
+        circles.append(each.circles[sure])
+        families.append(np.full(int(sure.sum()), each.family))
+        confidences.append(confidence[sure])
+    return np.concatenate(circles), np.concatenate(families), np.concatenate(confidences)
+
+
+def confidence_of(candidates: Candidates, weights: Weights) -> NDArray[np.float64]:
+    """The collective estimate (n,): a logistic function of the weighted sum of what the filters say."""
+    k = candidates.family
+    x = terms((candidates.features - weights.centre[k]) / weights.spread[k])
+    return _logistic(weights.candidate[k, 0] + x @ weights.candidate[k, 1:])
+
+
+def terms(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normalised features (n, f) and their products in pairs (n, f + f (f + 1) / 2), within reason."""
+    x = np.clip(x, -4, 4)
+    a, b = np.triu_indices(x.shape[1])
+    return np.concatenate([x, x[:, a] * x[:, b]], axis=1)
+
+
+def _logistic(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(1 / (1 + np.exp(-np.clip(x, -30, 30))), float)
+
+
+def _detection(seen: Seen, circle: Floats, family: int, confidence: float, weights: Weights) -> Detection:
+    colour: Colour = FAMILIES[family]
+    if colour == "red":
+        tint = seen.tint(circle)
+        colour = "red" if weights.ripe[0] + weights.ripe[1:] @ tint >= 0 else "turning"
+    u, v, radius = (float(value) for value in circle)
+    return Detection(u_px=u, v_px=v, radius_px=radius, colour=colour, confidence=confidence)
+
+
+def colour_terms(bgr: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """What the colour planes look at in colours (n, 3), balanced, 0..1: all products up to the third degree (n, 20)."""
+    b, g, r = (np.log(np.asarray(bgr[:, k], float) + 0.06) for k in range(3))
+    x = np.stack([(b + g + r) / 3 + 1.2, r - g, b - g], axis=1)
+    parts = [np.ones(len(x))]
+    for i in range(4):
+        for j in range(4 - i):
+            parts += [x[:, 0] ** i * x[:, 1] ** j * x[:, 2] ** k for k in range(4 - i - j) if i + j + k]
+    return np.stack(parts, axis=1)
+
+
+def colour_table(colour: NDArray[np.float64]) -> Floats:
+    """How likely each colour is red and green fruit (BINS^3, 2); the bins' order is blue, green, red."""
+    axis = (np.arange(BINS) + 0.5) / BINS
+    bgr = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    odds = np.clip(colour_terms(bgr) @ colour.T, -20, 20)
+    total = 1 + np.exp(odds).sum(axis=1, keepdims=True)
+    return np.ascontiguousarray((np.exp(odds) / total).astype(np.float32))
+
+
+def gains_of(image: Image, norm: float) -> NDArray[np.float64]:
+    """Factors (3,) that make the image's generalised mean grey (shades of grey: Finlayson and Trezzi 2004)."""
+    sample = image[::4, ::4].reshape(-1, 3).astype(float) / 255
+    mean = np.maximum((sample**norm).mean(axis=0) ** (1 / norm), 1e-3)
+    level = BRIGHTNESS + 0.15 * (1 - 1 / norm)
+    return np.asarray(np.clip(level / mean, *GAIN_RANGE), float)
+
+
+class Seen:
+    """One image through the filters."""
+
+    def __init__(self, image: Image, balance_norm: float, table: Floats) -> None:
+        self.scale = LONG_SIDE_PX / max(image.shape[:2])
+        size = (max(round(image.shape[1] * self.scale), 16), max(round(image.shape[0] * self.scale), 16))
+        how = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_LINEAR
+        self.image = np.asarray(cv2.resize(image, size, interpolation=how), np.uint8)
+        self.gains = gains_of(self.image, balance_norm)
+        values = np.clip(np.arange(256)[None] / 255 * self.gains[:, None], 0, 1)
+        bins = np.minimum(values * BINS, BINS - 1).astype(np.uint8)
+        luma = (values * np.array(BGR_LUMA)[:, None]).astype(np.float32)
+        self.maps = np.empty((len(MAPS), *self.image.shape[:2]), np.float32)
+        kernels.planes(self.image, bins, luma, table, self.maps[:4])
+        self.maps[4] = smoothness(self.maps[2])
+        self.maps[6] = highlights(self.maps[2], self.maps[3])
+        self.areas = [areas(self.maps[k], self.maps[4]) for k in range(len(FAMILIES))]
+
+    def candidates(self) -> Iterator[Candidates]:
+        """Where circles and colour agree, for each colour and size."""
+        for family in range(len(FAMILIES)):
+            self.maps[5] = self.areas[family]
+            maps, zoom = self.maps, 1.0
+            for _ in range(LEVELS):
+                yield self._level(maps, family, zoom)
+                if min(maps.shape[1:]) < 4 * RADII_PX[1]:
+                    break
+                maps, zoom = halved(maps), zoom * 2
+
+    def _level(self, maps: Floats, family: int, zoom: float) -> Candidates:
+        source, votes = circle_votes(maps, family)
+        points = peaks(votes)
+        found = np.empty((len(points), len(FEATURES)), np.float32)
+        kernels.describe(maps, source, votes, points, family, RADII_PX[0] * 0.8, RADII_PX[1] * 1.3, found)
+        radius = found[:, -1] * zoom
+        found[:, -1] = np.log(radius)
+        circles = np.column_stack([(points + 0.5) * zoom, radius]) / self.scale
+        return Candidates(family, circles.astype(np.float32), found)
+
+    def tint(self, circle: Floats) -> NDArray[np.float64]:
+        """Log of red over green and of blue over green (2,) in the middle of a circle, balanced."""
+        u, v, radius = circle * self.scale
+        half = max(radius * 0.6, 1.0)
+        height, width = self.image.shape[:2]
+        rows = slice(int(np.clip(v - half, 0, height - 1)), int(np.clip(v + half + 1, 1, height)))
+        columns = slice(int(np.clip(u - half, 0, width - 1)), int(np.clip(u + half + 1, 1, width)))
+        pixels = self.image[rows, columns].reshape(-1, 3) / 255 * self.gains
+        weight = self.maps[0, rows, columns].reshape(-1, 1) + 1e-3
+        b, g, r = (pixels * weight).sum(axis=0) / weight.sum()
+        return np.array([math.log((r + 0.02) / (g + 0.02)), math.log((b + 0.02) / (g + 0.02))])
+
+
+def smoothness(brightness: Floats) -> Floats:
+    """1 where brightness does not change, towards 0 at edges and veins (Sobel)."""
+    gx = cv2.Sobel(brightness, cv2.CV_32F, 1, 0)
+    gy = cv2.Sobel(brightness, cv2.CV_32F, 0, 1)
+    return np.asarray(cv2.exp(cv2.magnitude(gx, gy) * (-1 / SOBEL_SOFT)), np.float32)
+
+
+def highlights(brightness: Floats, whiteness: Floats) -> Floats:
+    """1 on small white spots: brighter than all around by a step, and colourless."""
+    around = cv2.blur(brightness, (25, 25))
+    step = np.clip((brightness - around - HIGHLIGHT_STEP) * 4, 0, 1) * whiteness
+    return np.asarray(cv2.dilate(step, np.ones((3, 3), np.uint8)), np.float32)
+
+
+def areas(plane: Floats, smooth: Floats) -> Floats:
+    """1 on blobs of smooth fruit colour whose area lies between the least and the largest."""
+    height, width = plane.shape
+    small = cv2.resize(plane * (0.4 + 0.6 * smooth), (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((small > BLOB_FROM).astype(np.uint8), connectivity=4)
+    share = stats[:, cv2.CC_STAT_AREA] / labels.size
+    wanted = ((share >= AREA_MIN) & (share <= AREA_MAX)).astype(np.float32)
+    wanted[0] = 0
+    return np.asarray(cv2.resize(wanted[labels], (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def circle_votes(maps: Floats, family: int) -> tuple[Floats, Floats]:
+    """The plane whose discs are looked for (colour, brighter in the middle), and the votes for their centres (h, w)."""
+    source = np.ascontiguousarray(maps[family] * (0.35 + 0.65 * np.minimum(maps[2], 1)))
+    source = np.asarray(cv2.GaussianBlur(source, (3, 3), 0.8), np.float32)
+    votes = np.empty_like(source)
+    kernels.vote(source, STEEP, *RADII_PX, votes)
+    colour = cv2.blur(maps[family], (5, 5))
+    return source, np.asarray(cv2.GaussianBlur(votes, (5, 5), 1.2) * 4 + 0.5 * colour, np.float32)
+
+
+def peaks(votes: Floats) -> NDArray[np.int32]:
+    """Local maxima (n, 2: x, y) that have enough votes, the strongest first."""
+    tops = (votes >= VOTE_MIN) & (votes >= cv2.dilate(votes, np.ones((5, 5), np.uint8)))
+    ys, xs = np.nonzero(tops)
+    order = np.argsort(-votes[ys, xs], kind="stable")[:CANDIDATES_MAX]
+    return np.ascontiguousarray(np.column_stack([xs[order], ys[order]]).astype(np.int32))
+
+
+def halved(maps: Floats) -> Floats:
+    """The maps (n, h, w) at half their size."""
+    height, width = maps.shape[1] // 2, maps.shape[2] // 2
+    cut = maps[:, : 2 * height, : 2 * width]
+    return np.ascontiguousarray(
+        (cut[:, ::2, ::2] + cut[:, 1::2, ::2] + cut[:, ::2, 1::2] + cut[:, 1::2, 1::2]) * np.float32(0.25)
+    )
