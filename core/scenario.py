@@ -38,6 +38,8 @@ class Arena(_Section):
     width_m: Annotated[float, Field(ge=1.5, le=20)] = 3.0
     ceiling_m: Annotated[float, Field(ge=2, le=6)] = 2.6
     marker_spacing_m: Annotated[float, Field(ge=0.5, le=3)] = 1.5
+    lamps: Literal["white", "warm", "daylight", "purple"] = "white"
+    """The light that plants grow in and cameras see by."""
 
 
 class Climate(_Section):

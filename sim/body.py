@@ -36,6 +36,9 @@ class RobotFaults:
     pump: PumpFault = PumpFault.OK
     marker_blind: bool = False
     dead_battery: bool = False
+    camera: frozenset[str] = frozenset()
+    """The faults of `sim.faults` that befall the camera in the hand."""
+    overexposure: float = 1.0
 
 
 class RobotBody:

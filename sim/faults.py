@@ -26,13 +26,19 @@ KINDS: dict[str, tuple[Target, float | None, str]] = {
     "wheel_slip": ("robot", 3.0, "factor on the tyres' creep (0-20)"),
     "pump_stuck": ("robot", 0.0, "0: the pump does not start; 1: it does not stop"),
     "dead_battery": ("robot", None, "the pack gives nothing"),
+    "camera_silent": ("robot", None, "the hand's camera gives no picture"),
+    "camera_frozen": ("robot", None, "the hand's camera repeats its last picture"),
+    "camera_black": ("robot", None, "something covers the lens"),
+    "camera_overexposed": ("robot", 8.0, "factor on the exposure (1-20)"),
+    "camera_upside_down": ("robot", None, "the camera hangs the wrong way up"),
     "soil_stuck": ("plant", None, "the probe repeats its last reading"),
     "soil_open": ("plant", None, "the probe's wire is broken"),
     "soil_short": ("plant", None, "the probe's wire touches the supply"),
 }
 """Kind -> what it befalls, its default strength (None: it has none), what strength means or what happens."""
-_STRENGTH_MAX = {"serial_noise": 1.0, "wheel_slip": 20.0, "pump_stuck": 1.0}
+_STRENGTH_MAX = {"serial_noise": 1.0, "wheel_slip": 20.0, "pump_stuck": 1.0, "camera_overexposed": 20.0}
 _PROBE = {"soil_stuck": ProbeFault.STUCK, "soil_open": ProbeFault.OPEN, "soil_short": ProbeFault.SHORT}
+CAMERA = tuple(kind for kind in KINDS if kind.startswith("camera_"))
 FAULTS_MAX = 100
 
 
@@ -168,6 +174,9 @@ class FaultBoard:
             faults.marker_blind = bool(strengths)
         elif kind == "dead_battery":
             faults.dead_battery = bool(strengths)
+        elif kind in CAMERA:
+            faults.camera = faults.camera | {kind} if strengths else faults.camera - {kind}
+            faults.overexposure = max(self._strengths("camera_overexposed", target), default=1.0)
         elif kind == "wheel_slip":
             faults.wheel_slip = max(strengths, default=1.0)
         elif strengths:

@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 
 from core.clock import Clock
-from core.errors import NotFound
-from sim.camera.geoms import Geoms, Paint, geoms_of, paint_of, seen_by_hand
+from core.errors import NotFound, Unavailable
+from sim.body import RobotBody
+from sim.camera.geoms import Floats, Geoms, Paint, geoms_of, paint_of, repaint, seen_by_hand
 from sim.wiring import Rig
 
 OVERVIEW_EVERY_S = 0.4
 """Wall seconds for which the last overview is good enough."""
 OVERVIEW_COST_S = 0.4
-HAND_COST_S = 0.15
 HAND_SIZE = (640, 480)
+HAND_COST_S, DEPTH_COST_S = 0.20, 0.05
+"""At that size; a picture's cost goes with its pixels."""
 
 
 class Pictures:
@@ -28,6 +30,9 @@ class Pictures:
         self._paint: Paint = paint_of(rig.world.model)
         self._overview: asyncio.Task[bytes] | None = None
         self._overview_s = 0.0
+        self._last: dict[tuple[str, int, int], bytes] = {}
+        """The hands' last pictures, by robot and size: what a frozen camera repeats."""
+        self._taken = 0
 
     async def overview(self) -> bytes:
         """The garden from above as JPEG; askers at about the same time get the same picture."""
@@ -38,18 +43,36 @@ class Pictures:
         return await asyncio.shield(self._overview)
 
     async def hand(self, robot_id: str, width: int, height: int) -> bytes:
-        """What the camera in a robot's hand sees, as JPEG; raises NotFound."""
-        if robot_id not in self._rig.world.robots:
+        """What the camera in a robot's hand gives, as JPEG; raises NotFound, Unavailable when the camera is silent."""
+        faults = self._robot(robot_id).faults
+        if "camera_silent" in faults.camera:
+            raise Unavailable(f"the camera of {robot_id} is silent")
+        kept = self._last.get((robot_id, width, height))
+        if kept is None or "camera_frozen" not in faults.camera:
+            job = self._hand_job(robot_id, width, height)
+            kept = await self._clock.offload(job, HAND_COST_S * width * height / (HAND_SIZE[0] * HAND_SIZE[1]))
+            self._last[robot_id, width, height] = kept
+        return kept
+
+    async def depth(self, robot_id: str, width: int, height: int) -> bytes:
+        """The hand's view as depth along its axis: a PNG of 16-bit millimetres, 0 where nothing is; raises NotFound."""
+        self._robot(robot_id)
+        return await self._clock.offload(self._depth_job(robot_id, width, height), DEPTH_COST_S)
+
+    def _robot(self, robot_id: str) -> RobotBody:
+        """Raises NotFound."""
+        if (robot := self._rig.world.robots.get(robot_id)) is None:
             known = ", ".join(self._rig.world.robots)
             raise NotFound(f"no robot {robot_id}", hint=f"robots: {known}")
-        return await self._clock.offload(self._hand_job(robot_id, width, height), HAND_COST_S)
+        return robot
 
     def _geoms(self) -> Geoms:
         self._rig.clockwork.catch_up()
-        return geoms_of(self._rig.world.model, self._rig.world.data)
+        return geoms_of(self._rig.world.model, self._rig.world.data, self._paint)
 
     def _overview_job(self) -> Callable[[], bytes]:
-        geoms, paint, scenario = self._geoms(), self._paint, self._rig.world.scenario
+        geoms, scenario = self._geoms(), self._rig.world.scenario
+        paint = repaint(self._paint, self._rig.world.model)
         facts, caption = _facts(self._rig), _caption(self._rig)
 
         def job() -> bytes:
@@ -62,20 +85,40 @@ class Pictures:
         return job
 
     def _hand_job(self, robot_id: str, width: int, height: int) -> Callable[[], bytes]:
-        self._rig.clockwork.catch_up()
-        model, data = self._rig.world.model, self._rig.world.data
-        geoms, T_world_cam = seen_by_hand(model, data, robot_id)
-        paint = self._paint
-        lamps_m, lamps_rgb = np.array(data.light_xpos), np.array(model.light_diffuse, dtype=np.float64)
+        geoms, T_world_cam = self._seen(robot_id)
+        paint, faults = repaint(self._paint, self._rig.world.model), self._robot(robot_id).faults
+        broken, overexposure = faults.camera, faults.overexposure
+        lamps_m, tint = np.array(self._rig.world.data.light_xpos), self._rig.world.scenario.arena.lamps
+        self._taken += 1
+        seed = self._taken
 
         def job() -> bytes:
             from sim.camera import hand, overview
 
-            camera = hand.camera(width, height)
-            light = hand.light_of(lamps_m, lamps_rgb)
-            return overview.jpeg(hand.draw(camera, T_world_cam, geoms, paint, light))
+            light = hand.light_of(lamps_m, hand.LAMP_RGB[tint], hand.nearest_lamp(lamps_m, T_world_cam))
+            if "camera_black" in broken:
+                light = hand.DARK
+            sensor = hand.Sensor(exposure=overexposure)
+            picture = hand.draw(hand.camera(width, height), T_world_cam, geoms, paint, light, sensor, seed)
+            if "camera_upside_down" in broken:
+                picture = np.ascontiguousarray(picture[::-1, ::-1])
+            return overview.jpeg(picture)
 
         return job
+
+    def _depth_job(self, robot_id: str, width: int, height: int) -> Callable[[], bytes]:
+        geoms, T_world_cam = self._seen(robot_id)
+
+        def job() -> bytes:
+            from sim.camera import hand
+
+            return hand.depth_png(hand.camera(width, height), T_world_cam, geoms)
+
+        return job
+
+    def _seen(self, robot_id: str) -> tuple[Geoms, Floats]:
+        self._rig.clockwork.catch_up()
+        return seen_by_hand(self._rig.world.model, self._rig.world.data, robot_id, self._paint)
 
 
 def _facts(rig: Rig) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from core.clock import Clock
-from core.errors import Unprocessable
+from core.errors import Unavailable, Unprocessable
 from core.mesh.auth import Caller, Verifier
 from core.mesh.chassis import allow, body, create_app, version
 from core.mesh.events import EventLog
@@ -31,6 +31,12 @@ from sim.truth import Truth
 from sim.wiring import Rig, assemble, power_up, serve
 
 T = TypeVar("T")
+FILM_TYPE = "multipart/x-mixed-replace; boundary=frame"
+FILM_FPS_MAX = 25.0
+FILM_FRAMES_MAX = 4000
+_Robot = Annotated[str, Path(max_length=40)]
+_Width = Annotated[int, Query(ge=32, le=640)]
+_Height = Annotated[int, Query(ge=24, le=480)]
 
 
 class ClockState(Document):
@@ -134,7 +140,7 @@ def make_node(
     )
     rig.faults.on_end = lambda fault: _note(events, "fault over", fault)
     _measure(registry, rig)
-    _look_routes(app, rig, Pictures(rig, pace))
+    _look_routes(app, rig, Pictures(rig, pace), pace)
     _clock_routes(app, rig, events)
     _fault_routes(app, rig, events)
     own: list[Loop] = [lambda: rig.clockwork.run(pace)]
@@ -165,7 +171,7 @@ def _measure(registry: CollectorRegistry, rig: Rig) -> None:
         Gauge(name, text, registry=registry).set_function(value)
 
 
-def _look_routes(app: FastAPI, rig: Rig, pictures: Pictures) -> None:
+def _look_routes(app: FastAPI, rig: Rig, pictures: Pictures, pace: Clock) -> None:
     @app.get("/truth", summary="What is so, exactly", tags=["world"])
     async def truth() -> Truth:
         rig.clockwork.catch_up()
@@ -176,12 +182,37 @@ def _look_routes(app: FastAPI, rig: Rig, pictures: Pictures) -> None:
         return _jpeg(await pictures.overview())
 
     @app.get("/cameras/{robot}/hand.jpg", summary="What a robot's hand sees", tags=["world"], response_class=Response)
-    async def hand(
-        robot: Annotated[str, Path(max_length=40)],
-        w: Annotated[int, Query(ge=32, le=640)] = HAND_SIZE[0],
-        h: Annotated[int, Query(ge=24, le=480)] = HAND_SIZE[1],
-    ) -> Response:
+    async def hand(robot: _Robot, w: _Width = HAND_SIZE[0], h: _Height = HAND_SIZE[1]) -> Response:
         return _jpeg(await pictures.hand(robot, w, h))
+
+    @app.get("/cameras/{robot}/hand.mjpg", summary="The same as a film", tags=["world"], response_class=StreamingResponse)
+    async def film(
+        robot: _Robot,
+        w: _Width = HAND_SIZE[0],
+        h: _Height = HAND_SIZE[1],
+        fps: Annotated[float, Query(ge=0.1, le=FILM_FPS_MAX, description="Pictures a garden second, at most")] = 4.0,
+    ) -> StreamingResponse:
+        first = await pictures.hand(robot, w, h)
+        return StreamingResponse(_film(first, pictures, pace, robot, (w, h), 1.0 / fps), media_type=FILM_TYPE)
+
+    @app.get("/cameras/{robot}/hand.png", summary="How far it is, 16-bit mm", tags=["world"], response_class=Response)
+    async def depth(robot: _Robot, w: _Width = HAND_SIZE[0], h: _Height = HAND_SIZE[1]) -> Response:
+        data = await pictures.depth(robot, w, h)
+        return Response(data, media_type="image/png", headers={"cache-control": "no-store"})
+
+
+async def _film(
+    first: bytes, pictures: Pictures, pace: Clock, robot: str, size: tuple[int, int], every_s: float
+) -> AsyncIterator[bytes]:
+    """Ends when the camera does, or after `FILM_FRAMES_MAX`: whoever still watches asks again."""
+    picture = first
+    for _ in range(FILM_FRAMES_MAX):
+        yield b"--frame\r\ncontent-type: image/jpeg\r\ncontent-length: %d\r\n\r\n%b\r\n" % (len(picture), picture)
+        await pace.sleep(every_s)
+        try:
+            picture = await pictures.hand(robot, *size)
+        except Unavailable:
+            return
 
 
 def _jpeg(data: bytes) -> Response:

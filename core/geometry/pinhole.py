@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Distortion = tuple[float, float, float, float, float]
 """k1, k2, p1, p2, k3."""
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
-_UNDISTORT_ROUNDS = 8
+_UNDISTORT_ROUNDS = 25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

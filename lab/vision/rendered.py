@@ -32,7 +32,7 @@ from lab.vision import dataset
 from sim.camera import hand
 from sim.camera.geoms import Floats, Geoms, Paint, paint_of, seen_by_hand
 from sim.camera.raster import Raster, rasterise
-from sim.camera.shade import Light, Picture, shade
+from sim.camera.shade import Light, Picture
 from sim.scene.tomato import colour_of, rgba_of
 from sim.world import World
 
@@ -45,7 +45,10 @@ RADIUS_SHARE_MIN = 0.012
 VISIBLE_RATIO_MIN = 0.02
 """Less than this is not labelled at all."""
 SAME_PLACE_M = 2e-3
+LAMP_SHARES = (0.4, 0.2, 0.25, 0.15)
+"""How often the lamps are white, warm, like daylight, purple."""
 _TRIES = 200
+Rgb = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,6 +82,7 @@ class View:
     geoms: Geoms
     paint: Paint
     light: Light
+    sensor: hand.Sensor
 
 
 def frames(count: int, seed: int) -> Iterator[Frame]:
@@ -96,7 +100,9 @@ def garden_frames(group: str, count: int, seed: list[int]) -> Iterator[Frame]:
         size = SIZES[int(rng.integers(len(SIZES)))]
         view = _view(world, fruit, size, rng)
         raster = rasterise(view.camera, view.T_world_cam, view.geoms)
-        picture = shade(view.camera, view.T_world_cam, raster, view.paint, view.light)
+        picture = hand.draw_raster(
+            view.camera, view.T_world_cam, raster, view.geoms, view.paint, view.light, view.sensor, int(rng.integers(2**31))
+        )
         entry = {"width": size[0], "height": size[1], "group": group, "camera": _intrinsics(view.camera)}
         yield Frame(picture=picture, labels=entry | {"boxes": _boxes(view, raster, fruit)}, T_world_cam=view.T_world_cam)
 
@@ -151,13 +157,15 @@ def _view(world: World, fruit: list[Fruit], size: tuple[int, int], rng: np.rando
         world.data.joint(f"{name}/finger-{side}").qpos[0] = float(rng.uniform(0.0, 0.022))
     mujoco.mj_kinematics(world.model, world.data)
     mujoco.mj_camlight(world.model, world.data)
-    geoms, T_world_cam = seen_by_hand(world.model, world.data, name)
+    paint = _painted(paint_of(world.model), fruit)
+    geoms, T_world_cam = seen_by_hand(world.model, world.data, name, paint)
     return View(
         camera=hand.camera(*size),
         T_world_cam=T_world_cam,
         geoms=geoms,
-        paint=_painted(paint_of(world.model), fruit),
-        light=_light(world, rng),
+        paint=paint,
+        light=_light(world, T_world_cam, rng),
+        sensor=_sensor(rng),
     )
 
 
@@ -168,9 +176,30 @@ def _painted(paint: Paint, fruit: list[Fruit]) -> Paint:
     return replace(paint, rgba=rgba)
 
 
-def _light(world: World, rng: np.random.Generator) -> Light:
-    light = hand.light_of(np.array(world.data.light_xpos), np.array(world.model.light_diffuse, dtype=np.float64))
-    return replace(light, exposure=float(rng.uniform(0.6, 1.3)))
+def _light(world: World, T_world_cam: Floats, rng: np.random.Generator) -> Light:
+    """Lamps of any colour, moved about a little, stronger or weaker than what the walls send back."""
+    lamps_m = np.array(world.data.light_xpos) + rng.normal(0.0, 0.3, (world.model.nlight, 3))
+    names = list(hand.LAMP_RGB)
+    tint = np.array(hand.LAMP_RGB[names[int(rng.choice(len(names), p=LAMP_SHARES))]]) * rng.uniform(0.9, 1.1, 3)
+    light = hand.light_of(lamps_m, (tint[0], tint[1], tint[2]), hand.nearest_lamp(lamps_m, T_world_cam))
+    walls, around = rng.uniform(0.25, 1.15), rng.uniform(0.6, 1.5)
+    return replace(light, sky_rgb=_times(walls, light.sky_rgb), ambient_rgb=_times(around, light.ambient_rgb))
+
+
+def _times(factor: float, rgb: Rgb) -> Rgb:
+    return (factor * rgb[0], factor * rgb[1], factor * rgb[2])
+
+
+def _sensor(rng: np.random.Generator) -> hand.Sensor:
+    """As good cameras differ: exposure, noise, sharpness and white balance."""
+    return hand.Sensor(
+        exposure=float(np.exp(rng.normal(0.0, 0.22))),
+        white_balance=float(rng.uniform(0.45, 1.0)),
+        blur_px=float(rng.uniform(0.4, 1.0)),
+        vignette=float(rng.uniform(0.1, 0.35)),
+        read_noise=float(rng.uniform(0.003, 0.015)),
+        shot_noise=float(rng.uniform(0.008, 0.035)),
+    )
 
 
 def _scan_look(rng: np.random.Generator) -> Joints:
@@ -231,7 +260,7 @@ def _boxes(view: View, raster: Raster, fruit: list[Fruit]) -> list[dict[str, Any
     R, eye = view.T_world_cam[:3, :3], view.T_world_cam[:3, 3]
     seen = ((one, (one.centre_m - eye) @ R) for one in fruit if pixels[one.geom] > 0)
     boxes = [_box(view.camera, one, p_cam, int(pixels[one.geom])) for one, p_cam in seen if p_cam[2] > 2 * one.radius_m]
-    return [box for box in boxes if box["visible_ratio"] >= VISIBLE_RATIO_MIN]
+    return [box for box in boxes if box["visible_ratio"] >= VISIBLE_RATIO_MIN and min(box["w"], box["h"]) > 0]
 
 
 def _box(camera: Camera, fruit: Fruit, p_cam: Floats, pixels: int) -> dict[str, Any]:

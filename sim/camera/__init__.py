@@ -14,6 +14,7 @@ def warm() -> None:
         pos=np.zeros((0, 3)),
         mat=np.zeros((0, 9)),
         visible=np.zeros(0, dtype=np.bool_),
+        leaf=np.zeros(0, dtype=np.bool_),
     )
     bare = Paint(rgba=np.zeros((0, 4)), texture=np.zeros(0, dtype=np.int32), gloss=np.zeros(0))
     room = overview.Arena(length_m=4.0, width_m=3.0, ceiling_m=2.6)

@@ -81,7 +81,7 @@ def draw(geoms: Geoms, paint: Paint, arena: Arena, labels: Sequence[Label], capt
     lamp_m = tuple(6 * reach_m * side for side in _SHADOW)
     lamp = Lamp(pos_m=(lamp_m[0], lamp_m[1], lamp_m[2]), rgb=(0.85, 0.83, 0.78))
     shadow = cast_shadow(lamp, geoms, (0.0, 0.0, 0.3), reach_m)
-    picture = shade(camera, T_world_cam, rasterise(camera, T_world_cam, geoms), paint, Light(lamps=(lamp,)), shadow)
+    picture = shade(camera, T_world_cam, rasterise(camera, T_world_cam, geoms), geoms, paint, Light(lamps=(lamp,)), shadow)
     _write_labels(picture, camera, T_world_cam, labels)
     _text(picture, caption, (12, HEIGHT - 12), 0.5)
     return picture

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -22,6 +23,8 @@ PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6
 """mjtGeom; other kinds (height fields, meshes) are not drawn."""
 _NEAR_M = 1e-4
 _TINY = 1e-15
+LEAF_TEETH = 6.0
+"""On either side of a leaf."""
 _SLACK = 1e-9
 
 _jit = numba.njit(cache=True, nogil=True, fastmath=False)
@@ -40,18 +43,25 @@ class Raster:
     """(H, W, 3), world, towards the outside of the geom."""
 
 
-def rasterise(camera: Camera, T_world_cam: Floats, geoms: Geoms) -> Raster:
-    """What the camera at T_world_cam (4, 4) sees; releases the GIL while it works."""
+def rasterise(camera: Camera, T_world_cam: Floats, geoms: Geoms, *, normals: bool = True) -> Raster:
+    """What the camera at T_world_cam (4, 4) sees; without `normals` those stay zero. Releases the GIL while it works."""
     shape = (camera.height, camera.width)
     ids = np.full(shape, -1, dtype=np.int32)
     distance_m = np.full(shape, np.inf)
     normal = np.zeros((*shape, 3), dtype=np.float32)
-    rays = directions(camera)
-    columns, rows = _ranges(rays)
+    rays, columns, rows = lens_of(camera)
     T = np.ascontiguousarray(T_world_cam, dtype=np.float64)
-    _draw(T, columns, rows, rays, geoms.kind, geoms.size, geoms.pos, geoms.mat, geoms.visible, ids, distance_m)
-    _normals(T, rays, geoms.kind, geoms.size, geoms.pos, geoms.mat, ids, distance_m, normal)
+    _draw(T, columns, rows, rays, geoms.kind, geoms.size, geoms.pos, geoms.mat, geoms.visible, geoms.leaf, ids, distance_m)
+    if normals:
+        _normals(T, rays, geoms.kind, geoms.size, geoms.pos, geoms.mat, ids, distance_m, normal)
     return Raster(ids=ids, distance_m=distance_m, normal=normal)
+
+
+@lru_cache(maxsize=4)
+def lens_of(camera: Camera) -> tuple[Floats, Floats, Floats]:
+    """Unit rays (H, W, 3) in the camera frame, and `_ranges` of them; not to be written to."""
+    rays = directions(camera)
+    return rays, *_ranges(rays)
 
 
 def _ranges(rays: Floats) -> tuple[Floats, Floats]:
@@ -183,6 +193,19 @@ def _hit(kind: int, o: Floats, d: Floats, size: Floats) -> float:
     return _hit_plane(o, d, size)
 
 
+@_jit_inline
+def _in_leaf(o: Floats, d: Floats, size: Floats, t: float) -> bool:
+    """Whether an ellipsoid's surface point belongs to the leaf in it: from its foot at -x to its tip at +x."""
+    along = 0.5 + 0.5 * (o[0] + t * d[0]) / size[0]
+    if along <= 0.0 or along >= 1.0:
+        return False
+    across = abs(o[1] + t * d[1]) / size[1]
+    # Egg-shaped and drawn out to a point, its edge in teeth that lean forward.
+    width = math.sin(math.pi * along**0.72) * (1.0 - 0.35 * along)
+    tooth = LEAF_TEETH * along - 0.8 * across
+    return bool(across <= width * (1.12 - 0.34 * (tooth - math.floor(tooth))))
+
+
 @_jit
 def _widen(spread: Floats, c: Floats, extent: Floats) -> bool:
     """Grow `extent` (x0, x1, y0, y1 at depth 1) by the outline of the ellipsoid {c, spread}; False if it reaches behind."""
@@ -257,6 +280,7 @@ def _draw(
     positions: Floats,
     mats: Floats,
     visible: npt.NDArray[np.bool_],
+    leaves: npt.NDArray[np.bool_],
     ids: Ints,
     distance_m: Floats,
 ) -> None:
@@ -265,11 +289,12 @@ def _draw(
     eye = T[:3, 3].copy()
     extent = np.empty(4)
     d = np.empty(3)
+    form = np.empty(9)
     reach = np.empty(len(kinds))
     for g in range(len(kinds)):
-        reach[g] = np.linalg.norm(positions[g] - eye) - sizes[g].max()
+        reach[g] = np.linalg.norm(positions[g] - eye) - _bound(kinds[g], sizes[g])
     for g in np.argsort(reach):
-        kind = kinds[g]
+        kind, leaf, nearest = kinds[g], leaves[g], reach[g]
         if not visible[g] or not (kind == PLANE or SPHERE <= kind <= BOX):
             continue
         size = sizes[g].copy()
@@ -286,16 +311,72 @@ def _draw(
         if seen == 1:
             u0, u1 = _span(extent[0], extent[1], columns)
             v0, v1 = _span(extent[2], extent[3], rows)
+        rounded = _round_form(kind, M, o, size, form)
         for v in range(v0, v1):
             for u in range(u0, u1):
+                if nearest >= distance_m[v, u]:
+                    continue
                 x, y, z = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]
+                if rounded and _misses(form, x, y, z):
+                    continue
                 d[0] = M[0, 0] * x + M[0, 1] * y + M[0, 2] * z
                 d[1] = M[1, 0] * x + M[1, 1] * y + M[1, 2] * z
                 d[2] = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z
                 t = _hit(kind, o, d, size)
-                if 0.0 <= t < distance_m[v, u]:
+                if 0.0 <= t < distance_m[v, u] and (not leaf or _in_leaf(o, d, size, t)):
                     distance_m[v, u] = t
                     ids[v, u] = g
+
+
+@_jit
+def _bound(kind: int, size: Floats) -> float:
+    """Radius of a ball round a geom's origin that holds it."""
+    if kind == PLANE:
+        return np.inf
+    if kind == SPHERE:
+        x, y, z = size[0], 0.0, 0.0
+    elif kind == CAPSULE:
+        x, y, z = size[0] + size[1], 0.0, 0.0
+    elif kind == CYLINDER:
+        x, y, z = size[0], size[1], 0.0
+    else:
+        x, y, z = size[0], size[1], size[2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@_jit
+def _round_form(kind: int, M: Floats, o: Floats, size: Floats, form: Floats) -> bool:
+    """For round geoms: (b^2 - a c) of their quadratic, or of the endless cylinder round them, as a form in the ray.
+
+    form: xx, yy, zz, xy, xz, yz of a symmetric matrix; where it is negative the ray misses.
+    """
+    if kind in (BOX, PLANE):
+        return False
+    weight = np.empty(3)
+    for k in range(3):
+        if kind in (SPHERE, ELLIPSOID):
+            weight[k] = 1.0 / (size[k] * size[k])
+        else:
+            weight[k] = 1.0 / (size[0] * size[0]) if k < 2 else 0.0
+    c = -1.0
+    for k in range(3):
+        c += weight[k] * o[k] * o[k]
+    for index in range(6):
+        i, j = (0, 1, 2, 0, 0, 1)[index], (0, 1, 2, 1, 2, 2)[index]
+        a = bi = bj = 0.0
+        for k in range(3):
+            a += weight[k] * M[k, i] * M[k, j]
+            bi += weight[k] * M[k, i] * o[k]
+            bj += weight[k] * M[k, j] * o[k]
+        form[index] = (1.0 if index < 3 else 2.0) * (bi * bj - a * c)
+    form[6] = 1e-9 * max(abs(form[0]), abs(form[1]), abs(form[2]))
+    return True
+
+
+@_jit_inline
+def _misses(form: Floats, x: float, y: float, z: float) -> bool:
+    det = x * (form[0] * x + form[3] * y + form[4] * z) + y * (form[1] * y + form[5] * z) + form[2] * z * z
+    return bool(det < -form[6])
 
 
 @_jit

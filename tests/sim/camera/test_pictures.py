@@ -1,19 +1,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
-from core.geometry.pinhole import directions, from_fov, look_at, project
+from core.geometry.pinhole import Camera, directions, from_fov, look_at, project
 from core.scenario import find
 from sim.camera import hand, overview
-from sim.camera.geoms import ASTROTURF, LEAF, SOIL, Geoms, Paint, geoms_of, paint_of
+from sim.camera.geoms import ASTROTURF, FRUIT, LEAF, SOIL, Floats, Geoms, Paint, geoms_of, paint_of
 from sim.camera.raster import rasterise
 from sim.camera.shade import Lamp, Light, cast_shadow, shade
 from sim.scene.build import build
+from sim.scene.tomato import rgba_of
 
 UP = np.array([0.0, 0.0, 1.0])
 BALL_OVER_FLOOR = """<mujoco><worldbody>
@@ -62,6 +62,26 @@ def test_textures_follow_from_names(garden: tuple[mujoco.MjModel, mujoco.MjData]
     assert texture[model.geom("floor-slab").id] == ASTROTURF
     assert texture[model.geom("plant-1/soil").id] == SOIL
     assert (texture == LEAF).sum() > 50
+    assert (texture == FRUIT).sum() >= sum(plant.fruit for plant in find("garden").plants)
+
+
+def test_a_leaf_is_a_part_of_its_ellipsoid_and_the_rest_stays_as_it_was(
+    garden: tuple[mujoco.MjModel, mujoco.MjData],
+) -> None:
+    model, data = garden
+    paint = paint_of(model)
+    camera = from_fov(160, 120, math.radians(60.0))
+    T_world_cam = look_at(np.array([-1.2, 0.9, 0.5]), np.array([-0.5, 0.75, 0.55]), UP)
+    whole, cut = (rasterise(camera, T_world_cam, geoms_of(model, data, p)) for p in (None, paint))
+    leaf = np.append(paint.texture == LEAF, False)
+    assert (whole.ids == cut.ids)[~leaf[whole.ids]].all()
+    assert 0.4 < leaf[cut.ids].sum() / leaf[whole.ids].sum() < 0.9
+
+
+@pytest.mark.parametrize("ripeness", [0.1, 0.5, 0.6, 0.7, 0.9])
+def test_how_ripe_a_fruit_is_can_be_told_from_its_colour(ripeness: float) -> None:
+    paint = Paint(rgba=np.array([rgba_of(ripeness)]), texture=np.array([FRUIT], dtype=np.int32), gloss=np.zeros(1))
+    assert rgba_of(float(paint.ripeness[0])) == pytest.approx(rgba_of(ripeness), abs=0.02)
 
 
 @pytest.mark.parametrize(("length_m", "width_m"), [(4.0, 3.0), (1.5, 1.5), (20.0, 3.0), (3.0, 20.0)])
@@ -83,7 +103,7 @@ def test_a_ball_casts_a_shadow_away_from_the_lamp() -> None:
     camera, T_world_cam = from_fov(200, 200, math.radians(60.0)), look_at(np.array([0.0, -0.01, 3.5]), np.zeros(3), UP)
     raster = rasterise(camera, T_world_cam, geoms)
     shadow = cast_shadow(lamp, geoms, (0.0, 0.0, 0.0), 2.0)
-    lit, shaded = (shade(camera, T_world_cam, raster, paint, light, s) for s in (None, shadow))
+    lit, shaded = (shade(camera, T_world_cam, raster, geoms, paint, light, s) for s in (None, shadow))
     darker = (lit.astype(int) - shaded).max(axis=2) > 30
     assert 0.005 < darker.mean() < 0.05
     middle = np.argwhere(darker & (raster.ids == 0)).mean(axis=0)
@@ -91,15 +111,43 @@ def test_a_ball_casts_a_shadow_away_from_the_lamp() -> None:
     assert middle == pytest.approx(expected, abs=6)
 
 
+def view_of_the_ball() -> tuple[Camera, Floats]:
+    return hand.camera(64, 48), look_at(np.array([1.5, 0.0, 0.8]), np.array([0.0, 0.0, 0.6]), UP)
+
+
 def test_a_darker_exposure_darkens_and_a_red_ball_stays_red() -> None:
     geoms, paint = seen(BALL_OVER_FLOOR)
-    light = Light(lamps=(Lamp(pos_m=(1.0, -1.0, 3.0), rgb=(0.8, 0.8, 0.8)),))
-    camera, T_world_cam = hand.camera(64, 48), look_at(np.array([1.5, 0.0, 0.8]), np.array([0.0, 0.0, 0.6]), UP)
+    light = hand.light_of(np.array([[1.0, -1.0, 3.0]]))
+    camera, T_world_cam = view_of_the_ball()
     ball = rasterise(camera, T_world_cam, geoms).ids == 1
-    bright = hand.draw(camera, T_world_cam, geoms, paint, light)[ball].mean(axis=0)
-    dark = hand.draw(camera, T_world_cam, geoms, paint, replace(light, exposure=0.4))[ball].mean(axis=0)
+    bright, dark = (
+        hand.draw(camera, T_world_cam, geoms, paint, light, hand.Sensor(exposure=e))[ball].mean(axis=0) for e in (1.0, 0.4)
+    )
     assert (dark < bright).all()
-    assert bright[2] > 3 * max(bright[0], bright[1])
+    assert bright[2] > 2 * max(bright[0], bright[1])
+
+
+def test_white_balance_takes_the_tint_of_grow_lamps_out_of_a_grey_floor() -> None:
+    geoms, paint = seen(BALL_OVER_FLOOR)
+    light = hand.light_of(np.array([[1.0, -1.0, 3.0]]), hand.LAMP_RGB["purple"])
+    camera, T_world_cam = view_of_the_ball()
+    floor = rasterise(camera, T_world_cam, geoms).ids == 0
+    tints = []
+    for strength in (0.0, 1.0):
+        blue, green, red = hand.draw(camera, T_world_cam, geoms, paint, light, hand.Sensor(white_balance=strength))[
+            floor
+        ].mean(axis=0)
+        tints.append(max(blue, red) / green)
+    assert tints[0] > 1.5
+    assert tints[1] < 1.15
+
+
+def test_noise_is_a_function_of_its_seed() -> None:
+    geoms, paint = seen(BALL_OVER_FLOOR)
+    light = hand.light_of(np.array([[1.0, -1.0, 3.0]]))
+    first, again, other = (hand.draw(*view_of_the_ball(), geoms, paint, light, seed=s) for s in (1, 1, 2))
+    assert (first == again).all()
+    assert 0 < np.abs(first.astype(int) - other).mean() < 12
 
 
 def test_the_same_scene_gives_the_same_picture() -> None:

@@ -102,3 +102,13 @@ def test_a_scaled_camera_sees_the_same_corners() -> None:
     small = big.scaled(320, 240)
     edge = (np.array([0.0, 640.0]) - big.cx) / big.fx
     assert (np.array([0.0, 320.0]) - small.cx) / small.fx == pytest.approx(edge)
+
+
+def test_the_lens_bends_the_picture_and_its_rays_alike() -> None:
+    """A distorted camera sees at each pixel what a ray through that pixel meets, up to the corners."""
+    model, data = crowd(3, 120)
+    camera = from_fov(160, 120, math.radians(58.0), (-0.28, 0.09, 0.002, -0.001, -0.01))
+    for T_world_cam in poses():
+        ours = rasterise(camera, T_world_cam, geoms_of(model, data))
+        ids, _, _ = cast(model, data, camera, T_world_cam)
+        assert (ours.ids == ids).mean() >= 0.999
