@@ -20,6 +20,7 @@ from sim.physics.pose import Planar, yaw_of
 from sim.physics.touch import Press
 from sim.physics.water import PumpFault, Tank
 from sim.physics.wheels import Drive
+from sim.scene.hang import GRIP_FRICTION
 from sim.scene.traits import Traits, generator
 
 TANK_NOISE_V = 0.004
@@ -39,6 +40,10 @@ class RobotFaults:
     camera: frozenset[str] = frozenset()
     """The faults of `sim.faults` that befall the camera in the hand."""
     overexposure: float = 1.0
+    force_stuck: bool = False
+    """The gripper's force sensor repeats its last reading."""
+    pad_friction: float | None = None
+    """Of wet or dusty finger pads; None: as they should be."""
 
 
 class RobotBody:
@@ -61,7 +66,10 @@ class RobotBody:
         self.docks: list[beams.Dock] = []
         self._scenario = scenario
         self._markers: dict[int, Pose2] = ceiling_markers(scenario.arena)
-        self._data = data
+        self._model, self._data = model, data
+        self._pads = [int(model.geom(f"{robot.id}/pad-{side}").id) for side in ("left", "right")]
+        self._pad_friction: float | None = None
+        self.stuck_v: float | None = None
         joint = model.joint(f"{robot.id}/free")
         self.qpos, self.dof = int(joint.qposadr[0]), int(joint.dofadr[0])
         self.marker_rng = generator(seed, f"markers/{robot.id}")
@@ -76,6 +84,9 @@ class RobotBody:
         self.drive.slip_factor = self.faults.wheel_slip
         self.drive.apply(dt_s, self.powered)
         self.arm.apply(dt_s, self.powered)
+        if self.faults.pad_friction != self._pad_friction:
+            self._pad_friction = self.faults.pad_friction
+            self._model.geom_friction[self._pads, 0] = GRIP_FRICTION[0] if self._pad_friction is None else self._pad_friction
 
     def after(self, docks: list[beams.Dock]) -> None:
         """Where are we, and does a dock hold us?"""
@@ -168,8 +179,17 @@ class RobotBody:
         if index == g.TANK_INPUT:
             return self._noisy(g.TANK_SENSOR_V_FULL * self.tank.level_ml / g.TANK_ML, TANK_NOISE_V)
         if index == g.FORCE_INPUT:
-            return self._noisy(g.FORCE_SENSOR_V_MAX * self.arm.grip_n() / g.FORCE_SENSOR_N_MAX, FORCE_NOISE_V)
+            return self._force_v()
         return 0.0
+
+    def _force_v(self) -> float:
+        if not self.faults.force_stuck:
+            self.stuck_v = None
+        elif self.stuck_v is not None:
+            return self.stuck_v
+        volts = self._noisy(g.FORCE_SENSOR_V_MAX * self.arm.grip_n() / g.FORCE_SENSOR_N_MAX, FORCE_NOISE_V)
+        self.stuck_v = volts if self.faults.force_stuck else None
+        return volts
 
     def _noisy(self, volts: float, sigma_v: float) -> float:
         return float(np.clip(volts + self.analog_rng.normal(0.0, sigma_v), 0.0, 5.0))

@@ -66,15 +66,18 @@ def put_back(world: World, snapshot: dict[str, Any]) -> None:
 
 
 def _put_physics(world: World, snapshot: dict[str, Any]) -> None:
-    """The state alone would wake every sleeper, so they are laid down again: MuJoCo does that at the end of a step only.
+    """The state alone would leave sleepers where they lie, or wake them: all are woken, then laid down as they were.
 
-    One step with everything awake but those about to fall asleep; then the state is put in place once more.
+    MuJoCo lays down at the end of a step only, so one step is done with everything awake but those about to fall asleep;
+    then the state is put in place once more.
     """
     model, data = world.model, world.data
     state, asleep = np.array(snapshot["physics"]), np.array(snapshot["asleep"], dtype=np.int32)
     mujoco.mj_setState(model, data, state, PHYSICS)
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    mujoco.mj_forward(model, data)
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     data.tree_asleep[:] = np.where(asleep >= 0, -1, -100)
-    data.tree_awake[:] = 1
     mujoco.mj_step(model, data)
     mujoco.mj_setState(model, data, state, PHYSICS)
     data.tree_asleep[:] = asleep
@@ -90,7 +93,8 @@ def _robot(robot: RobotBody) -> dict[str, Any]:
         "tank_ml": robot.tank.level_ml,
         "pump_on": robot.tank.switched_on,
         "pumped_ml": robot.pumped_ml,
-        "faults": asdict(robot.faults) | {"pump": robot.faults.pump.value},
+        "stuck_v": robot.stuck_v,
+        "faults": asdict(robot.faults) | {"pump": robot.faults.pump.value, "camera": sorted(robot.faults.camera)},
         "marker_rng": robot.marker_rng.bit_generator.state,
         "analog_rng": robot.analog_rng.bit_generator.state,
     }
@@ -102,7 +106,9 @@ def _put_robot(robot: RobotBody, kept: dict[str, Any]) -> None:
     robot.pack.charge_ah = kept["charge_ah"]
     robot.tank.level_ml, robot.tank.switched_on = kept["tank_ml"], kept["pump_on"]
     robot.pumped_ml = kept["pumped_ml"]
-    robot.faults = RobotFaults(**(kept["faults"] | {"pump": PumpFault(kept["faults"]["pump"])}))
+    faults = kept["faults"]
+    robot.faults = RobotFaults(**(faults | {"pump": PumpFault(faults["pump"]), "camera": frozenset(faults["camera"])}))
+    robot.stuck_v = kept["stuck_v"]
     robot.marker_rng.bit_generator.state = kept["marker_rng"]
     robot.analog_rng.bit_generator.state = kept["analog_rng"]
 

@@ -26,6 +26,9 @@ KINDS: dict[str, tuple[Target, float | None, str]] = {
     "wheel_slip": ("robot", 3.0, "factor on the tyres' creep (0-20)"),
     "pump_stuck": ("robot", 0.0, "0: the pump does not start; 1: it does not stop"),
     "dead_battery": ("robot", None, "the pack gives nothing"),
+    "force_stuck": ("robot", None, "the gripper's force sensor repeats its last reading"),
+    "slippery_grip": ("robot", 0.08, "friction of the finger pads (0-1; they have 1)"),
+    "branch_sway": ("plant", 0.02, "how far its trusses swing to and fro [m] (0-0.1)"),
     "camera_silent": ("robot", None, "the hand's camera gives no picture"),
     "camera_frozen": ("robot", None, "the hand's camera repeats its last picture"),
     "camera_black": ("robot", None, "something covers the lens"),
@@ -36,7 +39,14 @@ KINDS: dict[str, tuple[Target, float | None, str]] = {
     "soil_short": ("plant", None, "the probe's wire touches the supply"),
 }
 """Kind -> what it befalls, its default strength (None: it has none), what strength means or what happens."""
-_STRENGTH_MAX = {"serial_noise": 1.0, "wheel_slip": 20.0, "pump_stuck": 1.0, "camera_overexposed": 20.0}
+_STRENGTH_MAX = {
+    "serial_noise": 1.0,
+    "wheel_slip": 20.0,
+    "pump_stuck": 1.0,
+    "camera_overexposed": 20.0,
+    "slippery_grip": 1.0,
+    "branch_sway": 0.1,
+}
 _PROBE = {"soil_stuck": ProbeFault.STUCK, "soil_open": ProbeFault.OPEN, "soil_short": ProbeFault.SHORT}
 CAMERA = tuple(kind for kind in KINDS if kind.startswith("camera_"))
 FAULTS_MAX = 100
@@ -157,6 +167,7 @@ class FaultBoard:
             self._apply_robot(kind, target)
         else:
             self._apply_pot(target)
+            self._world.orchard.sway_m[target] = max(self._strengths("branch_sway", target), default=0.0)
 
     def _strengths(self, kind: str, target: str) -> list[float]:
         return [f.strength or 0.0 for f in self._faults.values() if (f.kind, f.target) == (kind, target)]
@@ -174,6 +185,10 @@ class FaultBoard:
             faults.marker_blind = bool(strengths)
         elif kind == "dead_battery":
             faults.dead_battery = bool(strengths)
+        elif kind == "force_stuck":
+            faults.force_stuck = bool(strengths)
+        elif kind == "slippery_grip":
+            faults.pad_friction = min(strengths, default=None)
         elif kind in CAMERA:
             faults.camera = faults.camera | {kind} if strengths else faults.camera - {kind}
             faults.overexposure = max(self._strengths("camera_overexposed", target), default=1.0)

@@ -23,8 +23,8 @@ DENSITY_KGM3 = 1000.0
 RADIUS_M, RADIUS_SIGMA_M, RADIUS_MIN_M, RADIUS_MAX_M = 0.0140, 0.0011, 0.0115, 0.0160
 GREEN_DAYS, TURNING_DAYS, RED_DAYS = (40.0, 3.0), (5.0, 0.7), (12.0, 2.5)
 """Mean and sigma of the days before the colour breaks, until it is red, until the fruit drops."""
-STEEPEST_SHARE, STEEPNESS = 0.42, 6.5
-"""Gompertz: the diameter grows fastest at this share of the green days, and is 98 % grown at their end."""
+STEEPEST_SHARE, STEEPNESS = 0.33, 5.0
+"""Gompertz: the diameter grows fastest at this share of the green days, and is 97 % grown at their end."""
 SEEN_M = 0.0025
 """A smaller fruit is part of its flower."""
 FLOWER_DAYS = (1.0, 1.8)
@@ -32,7 +32,7 @@ FLOWER_DAYS = (1.0, 1.8)
 TRUSS_DAYS = (9.0, 18.0)
 AGAIN_DAYS = (5.0, 12.0)
 """A place whose fruit is gone flowers again after so many days: it stands for the new truss that a plant would make."""
-STRENGTH_N = ((0.0, 6.5), (TURNING_FROM, 6.2), (RED_FROM, 2.0), (1.0, 1.1))
+STRENGTH_N = ((0.0, 6.5), (TURNING_FROM, 6.5), (RED_FROM, 2.0), (1.0, 1.1))
 """Pull that breaks the joint, by ripeness; drawn up to 23 % weaker or stronger for each fruit."""
 STRENGTH_SIGMA, STRENGTH_SPREAD = 0.12, 0.23
 
@@ -112,14 +112,14 @@ def flower(fruit_id: str, age_days: float, rng: np.random.Generator) -> Growing:
 
 
 def truss_ages(sizes: list[tuple[int, bool]], rng: np.random.Generator) -> list[list[float]]:
-    """Days since flowering of every place of trusses (size, in flower only), from below upwards and from the stem outwards.
+    """Days since flowering of every place of trusses (size, in flower yet), from below upwards and from the stem outwards.
 
     The lowest truss begins to be ripe.
     """
     ages: list[list[float]] = []
     first_days = GREEN_DAYS[0] + TURNING_DAYS[0] + rng.uniform(1.0, 6.0)
     for size, flowering in sizes:
-        age = -rng.uniform(0.0, 4.0) if flowering else first_days
+        age = rng.uniform(0.0, 6.0) if flowering else first_days
         ages.append([])
         for _ in range(size):
             ages[-1].append(float(age))

@@ -80,7 +80,7 @@ class World:
     @property
     def at_rest(self) -> bool:
         """Nothing is driven, pumped or poured, and nothing moves."""
-        if self.tap_board.open or not all(robot.idle for robot in self.robots.values()):
+        if self.tap_board.open or self.orchard.swaying or not all(robot.idle for robot in self.robots.values()):
             return False
         if self._still is None:
             self._still = float(np.abs(self.data.qvel).max()) < STILL
@@ -111,6 +111,8 @@ class World:
         self._live(TICK_S)
 
     def _step(self) -> None:
+        if self.orchard.swaying:
+            self.orchard.sway(self.time_s)
         if not self.orchard.near():
             mujoco.mj_step(self.model, self.data, nstep=STEPS_A_TICK)
             return
@@ -157,7 +159,8 @@ class World:
             pot.soil.advance(seconds, hour)
         for robot in self.robots.values():
             robot.live(seconds)
-        if self.orchard.live(self.time_s, {name: pot.thirst for name, pot in self.pots.items()}):
+        if self.orchard.due(self.time_s):
+            self.orchard.grow(self.time_s, {name: pot.thirst for name, pot in self.pots.items()})
             mujoco.mj_forward(self.model, self.data)
             self._still = None
 
@@ -190,6 +193,13 @@ class World:
         self.data.qvel[dof : dof + 6] = 0.0
         mujoco.mj_forward(self.model, self.data)
         self._look()
+
+    def take(self, robot_id: str) -> list[str]:
+        """Somebody empties a robot's basket; the ids of what was in it. Its places on the plants will flower again."""
+        taken = self.orchard.take(robot_id)
+        mujoco.mj_forward(self.model, self.data)
+        self._look()
+        return taken
 
     def snapshot(self) -> dict[str, Any]:
         """Everything that changes, as plain JSON."""

@@ -23,7 +23,7 @@ from core.scenario import Scenario
 from sim.growth import AGAIN_DAYS, RADIUS_MAX_M, Growing, flower, truss_ages
 from sim.scene.collide import ARM, FRUIT
 from sim.scene.hang import BUD_M, STALK_DAMPING, STALK_NPM, fruit_name
-from sim.scene.tomato import STEM_RGBA, Colour, Shrub, rgba_of
+from sim.scene.tomato import STEM_RGBA, TURNING_FROM, Colour, Shrub, rgba_of
 from sim.scene.traits import generator
 
 Where = Literal["plant", "hand", "basket", "ground"]
@@ -34,18 +34,20 @@ DAMPING_LINEAR, DAMPING_ANGULAR = 0.01, 2e-6
 KG_MIN = 0.009
 """A small green fruit is as heavy as this to the physics: a lighter one on so stiff a spring would outrun the step."""
 BENT_LOSS, BENT_RAD, TWIST_RAD = 0.5, math.pi / 2, math.pi
-GROW_S = 1800.0
+GROW_S = 3600.0
 """Fruit get their new size and colour this often."""
-STEP_M = 1e-5
-"""A change of radius below this waits."""
+STEP_M, STEP_RIPENESS = 1e-5, 0.003
+"""Changes of radius and of ripeness below these are not drawn yet."""
 ROT_DAYS = 3.0
 """What has lain on the ground for so long is gone."""
 NUDGE_MPS = 0.005
 """Given to a fruit whose stalk is cut: MuJoCo wakes it, and the world is no longer at rest."""
-NEAR_M = 0.75
-"""A hand this near to a stem is watched."""
+WAKE_MPS = 1e-4
+NEAR_M = 0.45
+"""A hand this near to a stem is watched; fruit hangs within 0.2 m of it."""
 ASTRAY_M = 0.002
 """A fruit further than this from where it would hang is being moved: growth leaves its place to the physics."""
+SWAY_HZ = 0.4
 GONE_MAX = 200
 DAY_S = 86400.0
 
@@ -82,6 +84,7 @@ class Spot:
     """The stalk holds."""
     drawn_m: float = 0.0
     """Radius as the model has it; 0: nothing to be seen yet."""
+    drawn_ripeness: float = 0.0
     torn_by: str | None = None
     torn_how: How | None = None
     lies_days: float = 0.0
@@ -90,6 +93,19 @@ class Spot:
     def there(self) -> bool:
         """Whether there is a fruit, not just a flower."""
         return self.drawn_m > 0.0
+
+
+@dataclass(slots=True)
+class _Swaying:
+    """A truss and the way in which it gives."""
+
+    plant_id: str
+    index: int
+    mocap: int
+    home_m: Any
+    angle_rad: float
+    phase_rad: float
+    swung: bool = False
 
 
 @dataclass(slots=True)
@@ -125,6 +141,9 @@ class Orchard:
         self.rng = {plant_id: generator(seed, f"growth/{plant_id}") for plant_id in shrubs}
         self.named = dict.fromkeys(shrubs, 0)
         self.grown_s = 0.0
+        self.sway_m = dict.fromkeys(shrubs, 0.0)
+        """How far something pushes a plant's trusses to and fro."""
+        self._trusses = list(self._mocaps(shrubs, seed))
         self.spots = [spot for plant_id, shrub in shrubs.items() for spot in self._spots(plant_id, shrub)]
         self._stems = [(plant.x_m, plant.y_m) for plant in scenario.plants]
         self._hands = {r.id: int(model.site(f"{r.id}/tool").id) for r in scenario.robots}
@@ -140,6 +159,16 @@ class Orchard:
             self._draw(spot)
             self._hang(spot)
         self._know()
+
+    def _mocaps(self, shrubs: Mapping[str, Shrub], seed: int) -> Iterator[_Swaying]:
+        for plant_id, shrub in shrubs.items():
+            rng = generator(seed, f"sway/{plant_id}")
+            for index in range(len(shrub.trusses)):
+                mocap = int(self._model.body(f"{plant_id}/truss/{index}").mocapid[0])
+                angle_rad, phase_rad = rng.uniform(0.0, math.tau, 2)
+                yield _Swaying(
+                    plant_id, index, mocap, self._data.mocap_pos[mocap].copy(), float(angle_rad), float(phase_rad)
+                )
 
     def _spots(self, plant_id: str, shrub: Shrub) -> Iterator[Spot]:
         rng = self.rng[plant_id]
@@ -192,6 +221,7 @@ class Orchard:
         self._tint(spot)
 
     def _tint(self, spot: Spot) -> None:
+        spot.drawn_ripeness = spot.growing.ripeness
         alpha = 1.0 if spot.there else 0.0
         self._model.geom_rgba[spot.ball] = (*rgba_of(spot.growing.ripeness)[:3], alpha)
         self._model.geom_rgba[spot.stub] = (*STEM_RGBA[:3], alpha)
@@ -218,18 +248,40 @@ class Orchard:
             spot.growing.strength_n * (1.0 - BENT_LOSS) if spot.hangs and spot.there else np.inf for spot in self.spots
         ]
 
+    # Being pushed
+
+    @property
+    def swaying(self) -> bool:
+        return any(self.sway_m.values()) or any(truss.swung for truss in self._trusses)
+
+    def sway(self, now_s: float) -> None:
+        """Trusses go where they are pushed now; back to their places once nothing pushes them."""
+        for truss in self._trusses:
+            far_m = self.sway_m[truss.plant_id]
+            if not far_m and not truss.swung:
+                continue
+            out_m = far_m * math.sin(math.tau * SWAY_HZ * now_s + truss.phase_rad)
+            push_m = (out_m * math.cos(truss.angle_rad), out_m * math.sin(truss.angle_rad), 0.0)
+            self._data.mocap_pos[truss.mocap] = truss.home_m + push_m
+            truss.swung = far_m > 0.0
+            for spot in self.spots:
+                if spot.hangs and (spot.plant_id, spot.truss) == (truss.plant_id, truss.index):
+                    self._data.qvel[spot.dof + 2] -= WAKE_MPS
+
     # Force
 
     def near(self) -> bool:
         """Whether a hand is near a plant, so that `watch` is wanted after every step."""
         for site in self._hands.values():
             x_m, y_m, _ = self._data.site_xpos[site].tolist()
-            if any(abs(x_m - x) < NEAR_M and abs(y_m - y) < NEAR_M for x, y in self._stems):
-                return True
+            for stem_x_m, stem_y_m in self._stems:
+                if abs(x_m - stem_x_m) < NEAR_M and abs(y_m - stem_y_m) < NEAR_M:
+                    return True
         return False
 
     def watch(self) -> bool:
         """Lets stalks break that are pulled too hard; whether one did."""
+        # A sleeping tendon has no length; nothing pulls at it either.
         pulls_n = STALK_NPM * (self._data.ten_length[self._tendons] - self._slack_m)
         broke = False
         for index in np.flatnonzero(pulls_n > self._least_n):
@@ -243,7 +295,9 @@ class Orchard:
         """What its stalk bears now."""
         if not spot.hangs:
             return 0.0
-        return max(0.0, STALK_NPM * (float(self._data.ten_length[spot.tendon]) - spot.stalk_m))
+        return max(
+            0.0, STALK_NPM * (math.dist(self._data.site_xpos[spot.knuckle], self._data.site_xpos[spot.top]) - spot.stalk_m)
+        )
 
     def strength_n(self, spot: Spot) -> float:
         """Pull that would break its joint as it is bent and twisted now."""
@@ -330,18 +384,18 @@ class Orchard:
 
     # Time
 
-    def live(self, now_s: float, thirst: Mapping[str, float]) -> bool:
-        """Growth up to `now_s`, in steps of `GROW_S`; whether anything is to be looked at afresh (`mj_forward`)."""
-        grown = False
-        while self.grown_s + GROW_S <= now_s + 1e-6:
+    def due(self, now_s: float) -> bool:
+        """Whether it is time to `grow`."""
+        return self.grown_s + GROW_S <= now_s + 1e-6
+
+    def grow(self, now_s: float, thirst: Mapping[str, float]) -> None:
+        """Growth up to `now_s`, in steps of `GROW_S`; `thirst` by plant. Positions want looking through afterwards."""
+        while self.due(now_s):
             self.grown_s += GROW_S
             days = GROW_S * self.days_a_second
             for spot in self.spots:
-                self._grow(spot, days, thirst.get(spot.plant_id, 0.0))
-            grown = True
-        if grown:
-            self._know()
-        return grown
+                self._grow(spot, days, thirst[spot.plant_id])
+        self._know()
 
     def _grow(self, spot: Spot, days: float, thirst: float) -> None:
         if not spot.hangs:
@@ -356,7 +410,9 @@ class Orchard:
             self._draw(spot)
             if at_rest:
                 self._hang(spot)
-        self._tint(spot)
+        ripeness = spot.growing.ripeness
+        if ripeness > TURNING_FROM and ripeness - spot.drawn_ripeness > STEP_RIPENESS:
+            self._tint(spot)
         if spot.growing.overripe:
             self.cut(spot)
 
@@ -371,6 +427,7 @@ class Orchard:
         taken = [spot.growing.fruit_id for spot in inside]
         for spot in inside:
             self._remove(spot, "taken", robot_id)
+        self._know()
         return taken
 
     def _remove(self, spot: Spot, how: Literal["taken", "rotten"], robot_id: str | None) -> None:
@@ -392,6 +449,8 @@ class Orchard:
     def kept(self) -> dict[str, Any]:
         return {
             "grown_s": self.grown_s,
+            "sway_m": dict(self.sway_m),
+            "swung": [truss.swung for truss in self._trusses],
             "named": dict(self.named),
             "rng": {name: rng.bit_generator.state for name, rng in self.rng.items()},
             "torn": {name: asdict(torn) for name, torn in self.torn.items()},
@@ -412,6 +471,9 @@ class Orchard:
 
     def put_back(self, kept: dict[str, Any]) -> None:
         """Sizes, colours and stalks as they were; where the bodies are is the physics' own state."""
+        self.sway_m = dict(kept["sway_m"])
+        for truss, swung in zip(self._trusses, kept["swung"], strict=True):
+            truss.swung = swung
         self.grown_s, self.named = float(kept["grown_s"]), dict(kept["named"])
         for name, state in kept["rng"].items():
             self.rng[name].bit_generator.state = state

@@ -23,9 +23,11 @@ from sim.scene.tomato import GREEN_RGBA, STEM_RGBA, Point, Shrub
 CAPSULE, SPHERE = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE
 STALK_NPM, STALK_DAMPING = 400.0, 0.4
 BUD_M = 0.0015
-SKIN_FRICTION = [0.6, 0.005, 0.0001]
-SKIN_SOLREF = [-10000.0, -200.0]
-"""Of fruit against anything but rubber pads: stiffness and damping that swallow a fall; a tomato hardly bounces."""
+SKIN_FRICTION = [0.6, 0.005, 0.0005]
+"""Sliding, turning, rolling: no tomato is a perfect ball, so it comes to rest on a floor that leans by up to two degrees."""
+SKIN_SOLREF, SKIN_SOLIMP = [-10000.0, -200.0], [0.99, 0.99, 0.001, 0.5, 2.0]
+"""Of fruit against anything but rubber pads: stiffness and damping that swallow a fall (a tomato hardly bounces), and so
+little give that friction does not creep: what lies in a basket lies still."""
 GRIP_FRICTION = [1.0, 0.005, 0.0001]
 GRIP_SOLREF, GRIP_SOLIMP = [0.005, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
 """Of skin on rubber pads: stiff, or a grip of 6 N squeezes the fruit out of the hand."""
@@ -58,7 +60,7 @@ def _add_bud(spec: Any, name: str, knuckle: Point, stalk_m: float) -> None:
     fruit = spec.worldbody.add_body(name=name, pos=[knuckle[0], knuckle[1], knuckle[2] - stalk_m - BUD_M])
     fruit.add_freejoint(name=name)
     fruit.add_geom(name=name, type=SPHERE, size=[RADIUS_MAX_M, 0, 0], mass=0.012, rgba=(*GREEN_RGBA[:3], 0.0),
-                   group=VISUAL_GROUP, condim=4, friction=SKIN_FRICTION, solref=SKIN_SOLREF, priority=1,
+                   group=VISUAL_GROUP, condim=6, friction=SKIN_FRICTION, solref=SKIN_SOLREF, solimp=SKIN_SOLIMP, priority=1,
                    **A_FRUIT)  # fmt: skip
     fruit.add_geom(name=f"{name}/stub", type=CAPSULE, size=[0.0008, 0, 0], fromto=[0, 0, BUD_M, 0, 0, BUD_M + stalk_m],
                    mass=0.0, rgba=(*STEM_RGBA[:3], 0.0), group=VISUAL_GROUP, **NOTHING)  # fmt: skip
