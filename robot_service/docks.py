@@ -107,6 +107,11 @@ class Docks:
         except (PeerDown, NotFound):
             return
 
+    async def release_others(self, name: str = "") -> None:
+        """Give back all but `name`: one whose dock we left in no orderly way would be renewed for ever."""
+        for other in [held for held in self.holds if held != name]:
+            await self.release(other)
+
     async def run(self) -> None:
         """Renew what is held, for ever."""
         while True:

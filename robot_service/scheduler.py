@@ -212,8 +212,7 @@ class Scheduler:
             await self.docks.news(HOME_LOOK_S - IDLE_LOOK_S)
 
     async def _stand_by(self) -> None:
-        for name in list(self.docks.holds):
-            await self.docks.release(name)
+        await self.docks.release_others()
         home = tuple_of(self.robot.settings.home)
         pose = self.robot.where.pose
         if pose is None:

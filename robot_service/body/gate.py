@@ -236,6 +236,8 @@ def _pump_refusal(setpoint: Setpoint, state: GateState) -> str:
         return "the pump runs only while docked"
     if setpoint.base != "stop" or state.v_mps != 0.0 or state.omega_radps != 0.0:
         return "the pump runs only while the base stands"
+    if state.arm_rad is None:
+        return "the pump runs only while the arm's place is known"
     if state.arm_moving:
         return "the pump runs only while the arm stands"
     if state.tank_ml is not None and state.tank_ml <= TANK_EMPTY_ML:

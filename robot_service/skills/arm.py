@@ -8,12 +8,15 @@ from core.errors import Refused
 from core.manipulation.arm import Joints, nozzle_goal
 from core.manipulation.swing import Leg, fold, leg_s, swing
 from core.robots import gardener
+from core.wire.body import BodyState
 from robot_service.robot import Robot, SkillFailed
 
 FIRST_FOLD_S = 2.0
 """An arm whose place nobody knows jumps at its first move; it goes to the folded pose."""
 SETTLE_S = 0.3
 LEG_LATE_S = 5.0
+NEAR_RAD = 0.03
+"""The board tells its pulses to 10 us, which is half of this."""
 
 
 def joints_now(robot: Robot) -> Joints:
@@ -26,24 +29,31 @@ def joints_now(robot: Robot) -> Joints:
 
 
 def is_folded(robot: Robot) -> bool:
-    if robot.body.state is None or robot.body.state.arm_rad is None:
-        return False
-    return all(abs(a - b) < 0.03 for a, b in zip(joints_now(robot), gardener.ARM_HOME_RAD, strict=True))
+    return robot.body.state is not None and not _away(robot.body.state, gardener.ARM_HOME_RAD)
+
+
+def _away(state: BodyState, q: Joints) -> str:
+    """Why the arm is not at `q`; empty when it is, as far as the board knows."""
+    if state.arm_rad is None:
+        return "the board does not know where it is"
+    if state.arm_moving:
+        return "it still moves"
+    return "" if all(abs(a - b) < NEAR_RAD for a, b in zip(state.arm_rad, q, strict=False)) else "it stands elsewhere"
 
 
 async def move_arm(robot: Robot, legs: Iterable[Leg]) -> None:
-    """Run the legs; each ends when its time is over and the board says that nothing moves."""
+    """Run the legs; each ends when its time is over and the board says that it is there. Raises SkillFailed when late."""
     robot.body.rest(False)
     for leg in legs:
         began_s = robot.clock.now()
         while True:
             robot.body.want(arm=leg.q, arm_s=leg.duration_s)
             state = await robot.tick()
-            spent_s = robot.clock.now() - began_s
-            if spent_s > leg.duration_s + SETTLE_S and not state.arm_moving:
+            spent_s, why = robot.clock.now() - began_s, _away(state, leg.q)
+            if spent_s > leg.duration_s + SETTLE_S and not why:
                 break
             if spent_s > leg.duration_s + LEG_LATE_S:
-                raise SkillFailed(f"the arm did not get there: {state.refusal or 'it still moves'}")
+                raise SkillFailed(f"the arm did not get there: {state.refusal or why}")
 
 
 async def fold_arm(robot: Robot) -> None:
@@ -59,7 +69,9 @@ async def fold_arm(robot: Robot) -> None:
 
 
 async def reach(robot: Robot, point_base_m: tuple[float, float, float]) -> Joints:
-    """Bring the nozzle to a point in the base frame; returns the joints held there."""
+    """Bring the nozzle to a point in the base frame; returns the joints held there. An arm of unknown place folds first."""
+    if robot.state().arm_rad is None:
+        await fold_arm(robot)
     try:
         goal = nozzle_goal(point_base_m)
         legs = swing(joints_now(robot), goal)

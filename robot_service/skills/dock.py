@@ -25,6 +25,7 @@ async def dock_at(robot: Robot, docks: Docks, name: str, *, yielding: bool = Fal
         return
     if robot.where.docked_at:
         await undock(robot, docks)
+    await docks.release_others(name)
     gate = Gate(robot, docks, dock, yielding)
     why = ""
     for attempt in range(TRIES):

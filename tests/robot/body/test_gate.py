@@ -165,6 +165,7 @@ def test_a_gripper_opening_out_of_range_is_refused(opening_m: float) -> None:
         (PUMP, {"docked": False}, "docked"),
         (PUMP, {"v_mps": 0.1}, "base stands"),
         (PUMP, {"arm_moving": True}, "arm stands"),
+        (PUMP, {"arm_rad": None}, "place is known"),
         (PUMP, {"tank_ml": 2.0}, "tank is empty"),
         (replace(PUMP, dose_ml=0.0), {}, "more than nothing"),
         (replace(PUMP, dose_ml=-5.0), {}, "more than nothing"),
@@ -277,7 +278,8 @@ def fault(sp: Setpoint, s: GateState, now_s: float, c: Command, debit_ml: float)
     if c.arm is not None and s.arm_rad is None and c.arm != gardener.ARM_HOME_RAD:
         return "moved an arm of unknown place"
     water = c.pump or debit_ml > 0
-    if water and (not sp.permit_id or not s.docked or s.dose.used or s.arm_moving or s.v_mps or c.base != "stop"):
+    arm_stands = s.arm_rad is not None and not s.arm_moving
+    if water and (not sp.permit_id or not s.docked or s.dose.used or not arm_stands or s.v_mps or c.base != "stop"):
         return "water where none may flow"
     if c.pump and (s.dose.debited_ml <= 0 or s.dose.delivered_ml >= min(s.dose.debited_ml, sp.dose_ml)):
         return "water beyond the dose"

@@ -224,8 +224,14 @@ class StandInBody:
         error = wrap(math.atan2(-y, max(0.15, -0.5 * x)) - yaw)
         return (SEEK_MPS if x < -0.1 else 0.04) * (abs(error) < 0.6), max(-1.0, min(1.0, 3.0 * error))
 
+    def forget_arm(self) -> None:
+        """The servo board lost its supply."""
+        self.arm = self._arm_said = self._arm_goal = None
+
     def _move_arm(self, wanted: Setpoint | None) -> None:
         now_s = self.clock.now()
+        if wanted is not None and self.arm is None and wanted.arm != gardener.ARM_HOME_RAD:
+            wanted = None
         if wanted is not None and wanted.arm is not None and self._arm_said != wanted.arm:
             self._arm_said = wanted.arm
             self._arm_from = self.arm or wanted.arm
@@ -240,7 +246,7 @@ class StandInBody:
 
     def _pump(self, wanted: Setpoint | None, dt_s: float) -> None:
         self.pumping = False
-        if wanted is None or not wanted.pump or not self.docked or self._arm_goal is not None:
+        if wanted is None or not wanted.pump or not self.docked or self.arm is None or self._arm_goal is not None:
             return
         self.permit_id = wanted.permit_id
         self.pumped_ml = self.permits.get(wanted.permit_id, 0.0)

@@ -155,6 +155,36 @@ def test_a_held_dock_is_waited_for_at_a_distance_with_the_reason():
     in_garden(story)
 
 
+def test_a_robot_carried_off_its_dock_gives_it_back_on_its_way_to_another():
+    async def story(garden):
+        await garden.award("plant-1")
+        await garden.award("plant-2")
+        body, first = garden.bodies["robot-1"], garden.plants["plant-1"]
+        await garden.until(lambda: body.docked, 80.0)
+        body.pose = (0.0, 0.2, 0.0)
+        await garden.until(lambda: garden.plants["plant-2"].ended, 200.0)
+        assert first.ended.state == "failed"
+        assert garden.plants["plant-2"].ended.state == "done"
+        assert first.docks.loan("plant-1", garden.clock.now()).robot_id == ""
+
+    in_garden(story)
+
+
+def test_a_servo_board_that_forgot_the_arm_makes_it_fold_before_it_reaches_and_pours():
+    async def story(garden):
+        await garden.award("plant-1")
+        body, robot = garden.bodies["robot-1"], garden.brains["robot-1"].robot
+        await garden.until(lambda: robot.activity.job == "dock", 80.0)
+        body.forget_arm()
+        await garden.until(lambda: body.arm is not None, 60.0)
+        assert body.arm == gardener.ARM_HOME_RAD
+        await garden.until(lambda: garden.plants["plant-1"].ended, 80.0)
+        assert garden.plants["plant-1"].ended.state == "done"
+        assert poured(garden, "plant-1") == pytest.approx(150.0, abs=0.5)
+
+    in_garden(story)
+
+
 def test_a_robot_that_rests_on_a_dock_leaves_when_somebody_wants_it():
     async def story(garden):
         await garden.award("plant-1")
