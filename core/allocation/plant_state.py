@@ -9,6 +9,7 @@ from typing import Any
 from core.allocation import permits
 from core.allocation.auction import Round
 from core.allocation.permits import Dose, OpenPermit
+from core.allocation.picking import OpenPick
 from core.wire.documents import Document
 from core.wire.market import (
     BID_WINDOW_S,
@@ -64,7 +65,13 @@ class MarketDocument(Document):
     tasks: list[Task] = []
     failures: dict[str, int] = {}
     open_permit: OpenPermit | None = None
+    """Of a dose."""
     doses: list[Dose] = []
+    open_pick: OpenPick | None = None
+    doubts: list[OpenPick] = []
+    """Picks that were permitted and that nobody told the end of."""
+    scanned: dict[str, str] = {}
+    """Inventory tasks whose scan has come, and its id."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -521,10 +521,10 @@ def test_a_market_that_forgets_the_permit_of_a_silent_robot_is_caught_by_the_sam
     """A test of the test: only the lease counts, as in a market without permits."""
 
     def fell_silent(self: Market, task: Any, live: Any, now_s: float) -> None:
-        self._permit, self._settle_at_s = None, math.inf
+        self._water.open, self._water.settle_at_s = None, math.inf
         self._release(task, f"{task.robot_id} fell silent", now_s, failed=False)
 
-    monkeypatch.setattr(Market, "_fell_silent", fell_silent)
+    monkeypatch.setattr(Market, "_silent", fell_silent)
     with pytest.raises(AssertionError, match="two doses"):
         play_many(range(200))
 
