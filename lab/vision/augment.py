@@ -119,14 +119,20 @@ def drawn_scale(source: Scene, rng: np.random.Generator) -> float:
     if len(source.boxes) == 0 or rng.random() < 0.5:
         return float(np.exp(rng.normal(0, 0.35)))
     wanted_px = np.exp(rng.uniform(*np.log(FRUIT_PX)))
-    return float(np.clip(wanted_px / (source.boxes[rng.integers(len(source.boxes)), 2] * LONG_SIDE_PX), 0.3, 2.5))
+    return float(np.clip(wanted_px / (source.boxes[drawn_fruit(source, rng), 2] * LONG_SIDE_PX), 0.3, 2.5))
+
+
+def drawn_fruit(source: Scene, rng: np.random.Generator) -> int:
+    """One of the fruit: a colour first, so that the rarer ones are seen as often."""
+    wanted = rng.choice(np.unique(source.colours))
+    return int(rng.choice(np.nonzero(source.colours == wanted)[0]))
 
 
 def drawn_focus(source: Scene, level: Image, window_px: float, rng: np.random.Generator) -> Array:
-    """The point of the image that comes to the square's middle: three times in four near a fruit."""
+    """The point of the image that comes to the square's middle: three times in five near a fruit."""
     shape = np.array([level.shape[1], level.shape[0]], np.float64)
-    if len(source.boxes) and rng.random() < 0.75:
-        focus = source.boxes[rng.integers(len(source.boxes)), :2] * shape.max()
+    if len(source.boxes) and rng.random() < 0.6:
+        focus = source.boxes[drawn_fruit(source, rng), :2] * shape.max()
         focus = focus + rng.uniform(-0.5, 0.5, 2) * window_px
     else:
         focus = rng.uniform(0, shape)
@@ -155,7 +161,7 @@ def with_fruit_of(other: Scene, base: Sample, rng: np.random.Generator) -> Sampl
     good = np.nonzero(other.counted & (other.boxes[:, 2:].min(1) > 0.06) & (other.trust > 0.5))[0]
     if len(good) == 0:
         return base
-    k = int(rng.choice(good))
+    k = int(rng.choice(good[other.colours[good] == rng.choice(np.unique(other.colours[good]))]))
     level = other.levels[0]
     u, v, w, h = other.boxes[k] * max(level.shape[:2])
     patch = level[max(int(v - h / 2), 0) : int(v + h / 2), max(int(u - w / 2), 0) : int(u + w / 2)]

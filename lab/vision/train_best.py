@@ -33,16 +33,16 @@ except ImportError as error:
 Array = NDArray[Any]
 Progress = Callable[[str], None]
 
-STEPS = 2600
-BATCH = 16
-RATE = 3e-3
+STEPS = 2200
+BATCH = 8
+RATE = 2e-3
 WEIGHT_DECAY = 1e-4
 AVERAGE = 0.998
-"""The weights that are kept are a running mean of the last few hundred steps' (Polyak and Juditsky 1992)."""
+"""The weights that are kept are a running mean of the last steps' (Polyak and Juditsky 1992), of fewer at the beginning."""
 SPREAD = 0.09
 """A fruit's blob in the centre map: standard deviation in parts of its box."""
 SIZE_WEIGHT, OFFSET_WEIGHT, COLOUR_WEIGHT = 1.0, 0.5, 0.6
-TELL_EVERY = 50
+TELL_EVERY = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,7 +107,7 @@ def fitted(photographs: Sequence[dataset.Photograph], seed: int, progress: Progr
         torch.nn.utils.clip_grad_norm_(network.parameters(), 10.0)
         optimiser.step()
         schedule.step()
-        follow(average, network, min(AVERAGE, (1 + step) / (20 + step)))
+        follow(average, network, min(AVERAGE, (1 + step) / (10 + step)))
         told.append(np.array([float(x.detach()) for x in losses]))
         if (step + 1) % TELL_EVERY == 0:
             fruit, offset, size, colour = np.mean(told, 0)
