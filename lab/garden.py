@@ -207,6 +207,7 @@ class Garden:
             identity=Identity.load(common.keys),
             verifier=Verifier.load(common.keys),
             peers=Peers(common.peers),
+            **({"cameras": running.transport} if process.kind == "robot" else {}),
         )
         self.mesh.attach(process.name, f"127.0.0.1:{process.port}", running.node.app)
         return list(running.node.loops)

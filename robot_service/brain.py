@@ -25,10 +25,11 @@ from core.wire.documents import NodeCard
 from core.wire.geometry import Point2, Pose2
 from core.wire.market import Announcement, Award, Bid
 from core.wire.robot import Job, JobRequest, Position, QueuedTask, RobotState, Stopped
+from hw.drivers.camera import open_camera
 from hw.links import Opener
 from robot_service.bodylink import BodyLink
 from robot_service.docks import Docks
-from robot_service.eye import Eye, Pictures
+from robot_service.eye import Eye
 from robot_service.ground import Ground
 from robot_service.localisation import Localisation
 from robot_service.neighbours import Neighbours
@@ -351,16 +352,22 @@ def build(
     verifier: Verifier | None = None,
     peers: Peers | None = None,
     open_reads: bool = True,
-    pictures: Pictures | None = None,
+    cameras: httpx.AsyncBaseTransport | None = None,
 ) -> Node:
-    """One robot's brain as a node. `verifier` None switches authentication off, for tests; `pictures` is its camera."""
+    """One robot's brain as a node. `verifier` None switches authentication off, for tests.
+
+    `cameras` carries the HTTP of its camera; None: the network.
+    """
     from robot_service.api import make_app
 
     mesh = Mesh(transport, identity, clock)
     lens = from_fov(*gardener.CAMERA_PIXELS, math.radians(gardener.CAMERA_FOV_Y_DEG))
-    eye = Eye(pictures, settings.detector, lens, clock)
+    camera = open_camera(settings.camera_url, clock, cameras) if settings.camera_url else None
+    eye = Eye(camera, settings.detector, lens, clock)
     brain = Brain(settings, clock, opener, mesh, peers if peers is not None else Peers(), rng, eye)
     app = make_app(brain, verifier, open_reads)
     app.state.brain = brain
-    loops = (brain.body.run, brain.robot.neighbours.run, brain.docks.run, brain.reporter.run, brain.scheduler.run)
-    return Node(id=settings.id, kind="robot", app=app, loops=loops)
+    loops = [brain.body.run, brain.robot.neighbours.run, brain.docks.run, brain.reporter.run, brain.scheduler.run]
+    if camera is not None:
+        loops.append(camera.run)
+    return Node(id=settings.id, kind="robot", app=app, loops=tuple(loops))

@@ -42,7 +42,7 @@ class Pictures(Protocol):
     """What the eye needs of a camera driver."""
 
     async def fresh(self, after_s: float) -> Frame:
-        """The first picture taken after `after_s` [garden s]; raises GardenError when none comes or it is useless."""
+        """The first picture taken after `after_s` [garden s]; raises GardenError when none comes or it is of no use."""
         ...
 
 

@@ -8,7 +8,7 @@ which needs no assumption about the size and is better by far. Everything in the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ SAME_FRUIT_M = 0.012
 MEET_M = 0.02
 """Rays of one fruit pass each other nearer than this."""
 RADII_M = (0.006, 0.024)
+TURNED_MIN, TURNED_RATIO = 6, 2.0
+"""So many circles must agree with the pictures turned, and this many times more than without, to believe it."""
 ROUNDS, ROUNDS_PLAIN = 12, 4
 """Of Gauss-Newton: the first find the neighbourhood, in the rest an outlier loses its weight."""
 
@@ -139,6 +141,30 @@ def fuse(camera: Camera, views: Sequence[View], radius_m: float = FRUIT_RADIUS_M
         if id(circle) not in owned and not _explained(camera, views, index, circle, tracks):
             tracks.append(_born(camera, index, views[index], circle, radius_m))
     return [_seen(track) for track in _merged(tracks)]
+
+
+def upside_down(camera: Camera, views: Sequence[View]) -> bool:
+    """Whether the pictures agree with one another far better when each is turned by 180 degrees.
+
+    A camera that was mounted the wrong way round sees fruit move against the arm: bearings of one fruit do not meet.
+    """
+    upright, turned = _agreement(camera, views), _agreement(camera, [_turned(camera, view) for view in views])
+    return turned >= TURNED_MIN and turned > TURNED_RATIO * upright
+
+
+def _agreement(camera: Camera, views: Sequence[View]) -> int:
+    """How many circles belong to fruit that three pictures or more show."""
+    circles = [(index, circle) for index, view in enumerate(views) for circle in view.detections]
+    if not circles:
+        return 0
+    return sum(len(track.hits) for track in _supported(camera, views, circles, FRUIT_RADIUS_M) if len(track.hits) > 2)
+
+
+def _turned(camera: Camera, view: View) -> View:
+    circles = (
+        replace(circle, u_px=camera.width - circle.u_px, v_px=camera.height - circle.v_px) for circle in view.detections
+    )
+    return replace(view, detections=tuple(circles))
 
 
 def _supported(

@@ -6,6 +6,7 @@ fruit is gone from where it hung.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -45,6 +46,9 @@ BLIND_MAX = 2
 DOCKING_SIGMA_M = 0.012
 """The plant's frame is known this well from a dock: the robot's own pose error."""
 SIGMA_M_MIN = 0.008
+PLACES_MAX = 2
+"""The dock, and once a little beside it."""
+SHIFT_MPS, SHIFT_RADPS, SHIFT_S, SHIFT_SHARE = 0.08, 0.15, 2.0, 0.7
 NEAR_SIDE_M, NEAR_DEPTH_M = 0.004, 0.008
 """The servo is content when the fruit is this near to the middle between the fingers, and to its distance."""
 FAR_OFF_M = 0.03
@@ -73,7 +77,6 @@ class Task:
 
     robot: Robot
     plant: PlantCard
-    T_base_plant: Array
     take_permit: TakePermit
     keep_picture: KeepPicture
 
@@ -92,7 +95,6 @@ async def harvest(
     task = Task(
         robot=robot,
         plant=plant,
-        T_base_plant=plant_in_base(robot.pose(), plant),
         take_permit=take_permit,
         keep_picture=keep_picture,
     )
@@ -115,7 +117,8 @@ async def harvest(
 
 
 def _place(task: Task, fruit: Fruit) -> Point3:
-    return mapped(task.T_base_plant, (fruit.x_m, fruit.y_m, fruit.z_m))
+    """Where the inventory has the fruit, seen from where the base is now."""
+    return mapped(plant_in_base(task.robot.pose(), task.plant), (fruit.x_m, fruit.y_m, fruit.z_m))
 
 
 def _obstacles(task: Task, fruits: Sequence[Fruit]) -> list[Obstacle]:
@@ -136,23 +139,54 @@ def _outermost(task: Task, left: Sequence[Fruit], hanging: Sequence[Fruit]) -> F
 
 
 async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit]) -> Pick:
-    """One fruit, from looking for it to the basket."""
-    robot, place, obstacles = task.robot, _place(task, fruit), _obstacles(task, others)
-    try:
-        ways = approaches(place, fruit.radius_m, obstacles)
-    except Refused as error:
-        return Pick(fruit_id=fruit.fruit_id, outcome="unreachable", reason=str(error)[:500])
-    why = "not seen where the inventory has it"
-    for way in ways[:WAYS_MAX]:
-        target = Target.expected(np.array(place), max(fruit.sigma_m, SIGMA_M_MIN) + DOCKING_SIGMA_M, fruit.radius_m)
+    """One fruit, from looking for it to the basket: from other sides, then from another place, then given up."""
+    why = ""
+    for place in range(PLACES_MAX):
+        if place:
+            await _shift(task.robot, _place(task, fruit)[1])
         try:
-            await _swing(robot, way.look, way.opening_m)
-            why = await servo(robot, way.pitch_rad, target, fruit.colour, place)
+            ways = approaches(_place(task, fruit), fruit.radius_m, _obstacles(task, others))
         except Refused as error:
-            why = str(error)
-        if not why:
-            return await _take(task, fruit, way, target)
-    return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason=f"from {min(len(ways), WAYS_MAX)} sides: {why}"[:500])
+            if place:
+                break
+            return Pick(fruit_id=fruit.fruit_id, outcome="unreachable", reason=str(error)[:500])
+        for way in ways[:WAYS_MAX]:
+            target = _expected(task, fruit)
+            try:
+                await _swing(task.robot, way.look, way.opening_m)
+                why = await servo(task.robot, way.pitch_rad, target, fruit.colour, _place(task, fruit))
+            except Refused as error:
+                why = reason_unless_halted(error)
+            if not why:
+                return await _take(task, fruit, way, target)
+    why = f"looked from {PLACES_MAX} places and several sides: {why}"
+    return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason=why[:500])
+
+
+def reason_unless_halted(error: Refused) -> str:
+    """Why a way did not work; an e-stop or a dead device ends everything instead."""
+    if isinstance(error, SkillFailed):
+        raise error
+    return str(error)
+
+
+def _expected(task: Task, fruit: Fruit) -> Target:
+    sigma_m = max(fruit.sigma_m, SIGMA_M_MIN) + DOCKING_SIGMA_M
+    return Target.expected(np.array(_place(task, fruit)), sigma_m, fruit.radius_m)
+
+
+async def _shift(robot: Robot, side_m: float) -> None:
+    """Move the base a hand's breadth towards the fruit's side: back in an arc, and most of the way forward again."""
+    await fold_arm(robot)
+    turn = math.copysign(SHIFT_RADPS, side_m)
+    for v_mps, omega_radps, seconds in ((-SHIFT_MPS, turn, SHIFT_S), (SHIFT_MPS, -turn, SHIFT_SHARE * SHIFT_S)):
+        until_s = robot.clock.now() + seconds
+        while robot.clock.now() < until_s:
+            robot.body.want("drive", v_mps, omega_radps)
+            state = await robot.tick()
+            if state.bump_left or state.bump_right:
+                break
+    await robot.pause(SETTLE_S)
 
 
 async def servo(robot: Robot, pitch_rad: float, target: Target, colour: str, place: Point3) -> str:
@@ -238,7 +272,7 @@ async def _take(task: Task, fruit: Fruit, way: Approach, target: Target) -> Pick
         try:
             held = await _grasp(robot, way, target)
         except Refused as error:
-            why = str(error)
+            why = reason_unless_halted(error)
             break
         if held:
             return await _carry(task, fruit, way, target, permit)
@@ -247,7 +281,7 @@ async def _take(task: Task, fruit: Fruit, way: Approach, target: Target) -> Pick
         try:
             lost = await servo(robot, way.pitch_rad, target, fruit.colour, _place(task, fruit))
         except Refused as error:
-            lost = str(error)
+            lost = reason_unless_halted(error)
         if lost:
             why = f"{why}; then {lost}"
             break

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from core.errors import Refused
-from core.inventory.sightings import Seen, fuse
+from core.inventory.sightings import Seen, fuse, upside_down
 from core.inventory.sightings import View as ScanView
 from core.manipulation.eye import camera_pose, scan_poses
 from core.manipulation.kinematics import Array
@@ -40,9 +40,11 @@ async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Sc
         views.append(ScanView(T_plant_cam=T_plant_base @ camera_pose(joints_now(robot)), detections=look.detections))
         robot.activity.waiting = f"view {number + 1} of {len(poses)}: {len(look.detections)} fruit"
     robot.activity.waiting = ""
-    camera = robot.eye.camera
-    seen = await robot.clock.offload(lambda: fuse(camera, views), FUSE_COST_S)
     await fold_arm(robot)
+    camera = robot.eye.camera
+    if await robot.clock.offload(lambda: upside_down(camera, views), 2 * FUSE_COST_S):
+        raise SkillFailed("the pictures agree only when turned: the camera is mounted upside down")
+    seen = await robot.clock.offload(lambda: fuse(camera, views), FUSE_COST_S)
     return document(robot, plant, scan_id, task_id, views, seen)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from core.geometry.pinhole import from_fov
-from core.inventory.sightings import View, fuse, lift_fixed_radius, triangulate
+from core.inventory.sightings import View, fuse, lift_fixed_radius, triangulate, upside_down
 from core.manipulation.eye import camera_pose, scan_poses
 from core.manipulation.servo import Target
 from core.perception.detection import Detection
@@ -102,3 +102,21 @@ def test_a_circle_that_only_one_picture_shows_stays_a_doubtful_fruit_at_the_pape
 def test_nothing_seen_is_no_fruit() -> None:
     assert fuse(CAMERA, [View(T_plant_cam=T, detections=()) for T in POSES]) == []
     assert fuse(CAMERA, []) == []
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_camera_that_hangs_upside_down_is_noticed_and_an_upright_one_is_not_blamed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    fruit = garden(rng)
+    circles = [[noisy(c, rng) for p, r, colour in fruit if (c := circle(p, r, T, colour)) is not None] for T in POSES]
+    turned = [
+        [
+            Detection(u_px=640 - c.u_px, v_px=480 - c.v_px, radius_px=c.radius_px, colour=c.colour, confidence=c.confidence)
+            for c in view
+        ]
+        for view in circles
+    ]
+    upright = [View(T_plant_cam=T, detections=tuple(view)) for T, view in zip(POSES, circles, strict=True)]
+    hanging = [View(T_plant_cam=T, detections=tuple(view)) for T, view in zip(POSES, turned, strict=True)]
+    assert not upside_down(CAMERA, upright)
+    assert upside_down(CAMERA, hanging)
