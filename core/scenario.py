@@ -94,6 +94,8 @@ class Robot(_Section):
     kind: Literal["gardener"] = "gardener"
     create: Literal["create1", "create2"] = "create2"
     docking: Literal["seek-dock", "beam"] = "seek-dock"
+    wrist: Literal["plain", "roll"] = "plain"
+    """Whether the gripper turns about the hand."""
     x_m: Finite
     y_m: Finite
     yaw_deg: Finite = 0.0

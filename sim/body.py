@@ -53,7 +53,7 @@ class RobotBody:
         self.id = robot.id
         self.faults = RobotFaults()
         self.drive = Drive(model, data, robot)
-        self.arm = Arm(model, data, robot.id)
+        self.arm = Arm(model, data, robot.id, rolls=robot.wrist == "roll")
         self.pack = Pack.at(robot.battery_ratio)
         self.tank = Tank(level_ml=robot.tank_ml, flow=traits.pump)
         self.pumped_ml = 0.0

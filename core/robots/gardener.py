@@ -90,6 +90,8 @@ SERVOS = {
     "wrist": _servo(3, -88, 88),
     "gripper": _servo(4, 0, 88, centre_deg=44.0),
 }
+ROLL_SERVO = _servo(5, -90, 90)
+"""Turns the fingers about hand x, positive from hand y towards hand z, on a robot whose wrist rolls (`wrist = "roll"`)."""
 PUMP_CHANNEL = 8
 """SSC-32 discrete output that switches the pump's relay."""
 FORCE_INPUT = 0

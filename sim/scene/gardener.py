@@ -51,8 +51,8 @@ REAR_CASTER_X_M = -0.150
 REAR_CASTER_RADIUS_M = 0.025
 
 FINGER_N_MAX = 12.0
-JOINT_KP = {"pan": 60.0, "shoulder": 80.0, "elbow": 60.0, "wrist": 20.0}
-JOINT_KV = {"pan": 3.0, "shoulder": 4.0, "elbow": 2.5, "wrist": 0.6}
+JOINT_KP = {"pan": 60.0, "shoulder": 80.0, "elbow": 60.0, "wrist": 20.0, "roll": 20.0}
+JOINT_KV = {"pan": 3.0, "shoulder": 4.0, "elbow": 2.5, "wrist": 0.6, "roll": 0.6}
 
 WHITE, GREY, DARK = (0.86, 0.87, 0.88, 1.0), (0.55, 0.57, 0.60, 1.0), (0.13, 0.13, 0.15, 1.0)
 BLUE, TANK_BLUE = (0.20, 0.35, 0.62, 1.0), (0.45, 0.68, 0.86, 1.0)
@@ -68,7 +68,7 @@ def add_gardener(spec: Any, robot: Robot, traits: Traits) -> None:
     _hull(base, robot.id)
     _wheels(spec, base, robot, traits)
     _casters(spec, base, robot.id)
-    _arm(spec, base, robot.id)
+    _arm(spec, base, robot.id, robot.wrist == "roll")
 
 
 def _hull(base: Any, name: str) -> None:
@@ -131,7 +131,7 @@ def _casters(spec: Any, base: Any, name: str) -> None:
                   group=VISUAL_GROUP, **NOTHING)  # fmt: skip
 
 
-def _arm(spec: Any, base: Any, name: str) -> None:
+def _arm(spec: Any, base: Any, name: str, rolls: bool) -> None:
     pan = base.add_body(name=f"{name}/pan", pos=[g.SHOULDER_X_M, 0, g.SHOULDER_Z_M], gravcomp=1)
     _joint(spec, pan, name, "pan", [0, 0, 1])
     _limb(pan, f"{name}/pan-hub", [0, 0, -0.02], [0, 0, 0.02], 0.024)
@@ -144,12 +144,12 @@ def _arm(spec: Any, base: Any, name: str) -> None:
     hand = fore.add_body(name=f"{name}/hand", pos=[g.FOREARM_M, 0, 0], gravcomp=1)
     _joint(spec, hand, name, "wrist", [0, -1, 0])
     _limb(hand, f"{name}/palm", [0, 0, 0], [0.055, 0, 0], 0.011)
-    _hand(spec, hand, name)
+    _hand(spec, hand, _rolling(spec, hand, name) if rolls else hand, name)
 
 
-def _joint(spec: Any, body: Any, name: str, joint: str, axis: list[float]) -> None:
+def _joint(spec: Any, body: Any, name: str, joint: str, axis: list[float], servo: g.Servo | None = None) -> None:
     """A hobby servo holds its joint like a stiff spring with a worm's friction; its speed is limited by what drives it."""
-    servo = g.SERVOS[joint]
+    servo = servo or g.SERVOS[joint]
     body.add_joint(name=f"{name}/{joint}", type=HINGE, axis=axis, range=[servo.min_rad, servo.max_rad], limited=True,
                    armature=0.02, damping=0.3)  # fmt: skip
     motor = spec.add_actuator(name=f"{name}/{joint}", target=f"{name}/{joint}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -161,10 +161,19 @@ def _limb(body: Any, name: str, a: list[float], b: list[float], radius_m: float)
                   group=VISUAL_GROUP, friction=[0.3, 0.005, 0.0001], **AN_ARM)  # fmt: skip
 
 
-def _hand(spec: Any, hand: Any, name: str) -> None:
-    """Two coupled fingers, the eye and the nozzle."""
+def _rolling(spec: Any, hand: Any, name: str) -> Any:
+    """The part of a rolling wrist that carries the fingers."""
+    cuff = hand.add_body(name=f"{name}/cuff", gravcomp=1)
+    cuff.add_geom(name=f"{name}/cuff", type=CAPSULE, size=[0.012, 0, 0], fromto=[0.045, 0, 0, 0.055, 0, 0], mass=0.01,
+                  rgba=DARK, group=VISUAL_GROUP, **NOTHING)  # fmt: skip
+    _joint(spec, cuff, name, "roll", [1, 0, 0], g.ROLL_SERVO)
+    return cuff
+
+
+def _hand(spec: Any, hand: Any, wrist: Any, name: str) -> None:
+    """Two coupled fingers on `wrist`, the eye and the nozzle on the hand."""
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        finger = hand.add_body(name=f"{name}/finger-{side}", pos=[0.05, 0, 0], gravcomp=1)
+        finger = wrist.add_body(name=f"{name}/finger-{side}", pos=[0.05, 0, 0], gravcomp=1)
         finger.add_joint(name=f"{name}/finger-{side}", type=SLIDE, axis=[0, sign, 0], range=[0.0, g.GRIPPER_OPEN_M / 2],
                          limited=True, armature=0.01, damping=2.0)  # fmt: skip
         finger.add_geom(name=f"{name}/rail-{side}", type=BOX, size=[0.035, 0.003, 0.006], pos=[0.035, sign * 0.011, 0],

@@ -300,6 +300,25 @@ def test_pushed_branches_carry_their_fruit_to_and_fro_and_come_back(world: World
     assert spot.hangs
 
 
+def test_a_rolling_wrist_twists_a_fruit_on_its_stalk_and_weakens_the_joint() -> None:
+    garden = find("garden")
+    robots = tuple(robot.model_copy(update={"wrist": "roll"}) for robot in garden.robots)
+    world = World(garden.model_copy(update={"robots": robots}), 7)
+    spot = first_red(world)
+    line = grasp(world, spot)
+    assert line is not None
+    before_n = world.orchard.strength_n(spot)
+    servo = g.ROLL_SERVO
+    for tick in range(1, 26):
+        world.servo_rig(ROBOT).set_pulse(servo.channel, servo.pulse_us(math.radians(60.0) * tick / 25))
+        world.advance(0.02)
+    world.advance(0.3)
+    assert world.robots[ROBOT].arm.now_rad["roll"] == pytest.approx(math.radians(60.0))
+    assert world.orchard.strength_n(spot) < before_n - 0.1 or not spot.hangs
+    pull(world, spot, line)
+    assert fact(world, spot).where == "hand"
+
+
 # Time and keeping
 
 
