@@ -13,8 +13,10 @@ Floats: TypeAlias = NDArray[np.float32]
 Bytes: TypeAlias = NDArray[np.uint8]
 Ints: TypeAlias = NDArray[np.int32]
 
-SPOKES = 24
-"""Directions in which an outline is looked for."""
+RADIUS_STEPS = 9
+"""Radii that are tried for an outline."""
+ZONES = (0.5, 0.9, 1.15, 1.5, 2.2)
+"""Outer radii of middle, rim, outline (not looked at), ring and what lies further, in radii."""
 
 
 @njit(cache=True, fastmath=True)
@@ -22,7 +24,7 @@ def planes(image: Bytes, bins: Bytes, luma: Floats, table: Floats, out: Floats) 
     """Colour planes of an image in one pass.
 
     `bins` (3, 256) and `luma` (3, 256) hold each channel's balanced value as a bin of 0..31 and as its share of brightness;
-    `table` (32768, 2) how likely a colour is red and green fruit. `out` (4, h, w): red, green, brightness, whiteness.
+    `table` (32768, 2) how likely a colour is red and green fruit. `out` (h, w, 4): red, green, brightness, whiteness.
     """
     height, width = image.shape[:2]
     for y in range(height):
@@ -30,11 +32,49 @@ def planes(image: Bytes, bins: Bytes, luma: Floats, table: Floats, out: Floats) 
             b, g, r = image[y, x, 0], image[y, x, 1], image[y, x, 2]
             kb, kg, kr = bins[0, b], bins[1, g], bins[2, r]
             index = (np.int32(kb) << 10) | (np.int32(kg) << 5) | np.int32(kr)
-            out[0, y, x] = table[index, 0]
-            out[1, y, x] = table[index, 1]
-            out[2, y, x] = luma[0, b] + luma[1, g] + luma[2, r]
+            out[y, x, 0] = table[index, 0]
+            out[y, x, 1] = table[index, 1]
+            out[y, x, 2] = luma[0, b] + luma[1, g] + luma[2, r]
             most = max(kb, kg, kr)
-            out[3, y, x] = np.float32(min(kb, kg, kr)) / np.float32(max(most, 1))
+            out[y, x, 3] = np.float32(min(kb, kg, kr)) / np.float32(max(most, 1))
+
+
+@njit(cache=True, fastmath=True)
+def halve(maps: Floats) -> Floats:
+    """The maps (h, w, n) at half their size."""
+    height, width, count = maps.shape[0] // 2, maps.shape[1] // 2, maps.shape[2]
+    out = np.empty((height, width, count), np.float32)
+    quarter = np.float32(0.25)
+    for y in range(height):
+        for x in range(width):
+            for k in range(count):
+                top = maps[2 * y, 2 * x, k] + maps[2 * y, 2 * x + 1, k]
+                out[y, x, k] = (top + maps[2 * y + 1, 2 * x, k] + maps[2 * y + 1, 2 * x + 1, k]) * quarter
+    return out
+
+
+@njit(cache=True)
+def tops(votes: Floats, least: float, most: int) -> Ints:
+    """Places (n, 2: x, y) of at least `least` that are the highest of their 5 x 5 neighbours; at most `most`, best first."""
+    height, width = votes.shape
+    found = np.empty((height * width // 4 + 1, 2), np.int32)
+    heights = np.empty(len(found), np.float32)
+    n = 0
+    for y in range(height):
+        for x in range(width):
+            here = votes[y, x]
+            if here < least or n == len(found):
+                continue
+            highest = True
+            for j in range(max(y - 2, 0), min(y + 3, height)):
+                for i in range(max(x - 2, 0), min(x + 3, width)):
+                    if votes[j, i] > here:
+                        highest = False
+            if highest:
+                found[n, 0], found[n, 1], heights[n] = x, y, here
+                n += 1
+    order = np.argsort(-heights[:n])[:most]
+    return found[:n][order]
 
 
 @njit(cache=True, fastmath=True)
@@ -62,19 +102,22 @@ def vote(image: Floats, steep: float, radius_min: int, radius_max: int, out: Flo
 
 
 @njit(cache=True, fastmath=True)
-def outline(image: Floats, u: float, v: float, radius_min: float, radius_max: float) -> tuple[float, float, float]:
-    """Radius of the bright disc round (u, v), how much of its edge is seen (0..1), and how steep that is on average."""
+def outline(
+    image: Floats, u: float, v: float, radius_min: float, radius_max: float, spokes: Floats
+) -> tuple[float, float, float]:
+    """Radius of the bright disc round (u, v), how much of its edge is seen (0..1), and how steep that is on average.
+
+    `spokes` (n, 2) are the directions in which the edge is looked for.
+    """
     height, width = image.shape
     best_radius, best_step, best_seen = radius_min, -1.0, 0.0
-    steps = 13
-    for k in range(steps):
-        radius = radius_min * (radius_max / radius_min) ** (k / (steps - 1))
+    for k in range(RADIUS_STEPS):
+        radius = radius_min * (radius_max / radius_min) ** (k / (RADIUS_STEPS - 1))
         width_px = max(1.0, 0.18 * radius)
         total, seen, asked = 0.0, 0, 0
-        for spoke in range(SPOKES):
-            cos, sin = math.cos(2 * math.pi * spoke / SPOKES), math.sin(2 * math.pi * spoke / SPOKES)
-            x0, y0 = int(u + (radius - width_px) * cos + 0.5), int(v + (radius - width_px) * sin + 0.5)
-            x1, y1 = int(u + (radius + width_px) * cos + 0.5), int(v + (radius + width_px) * sin + 0.5)
+        for i in range(spokes.shape[0]):
+            x0, y0 = int(u + (radius - width_px) * spokes[i, 0] + 0.5), int(v + (radius - width_px) * spokes[i, 1] + 0.5)
+            x1, y1 = int(u + (radius + width_px) * spokes[i, 0] + 0.5), int(v + (radius + width_px) * spokes[i, 1] + 0.5)
             if min(x0, x1, y0, y1) < 0 or max(x0, x1) >= width or max(y0, y1) >= height:
                 continue
             asked += 1
@@ -82,7 +125,7 @@ def outline(image: Floats, u: float, v: float, radius_min: float, radius_max: fl
             total += min(max(step, -0.3), 0.5)
             if step > 0.08:
                 seen += 1
-        if asked < SPOKES // 3:
+        if asked < spokes.shape[0] // 3:
             continue
         mean = total / asked
         if mean > best_step:
@@ -91,57 +134,87 @@ def outline(image: Floats, u: float, v: float, radius_min: float, radius_max: fl
 
 
 @njit(cache=True, fastmath=True)
-def disc_means(maps: Floats, u: float, v: float, inner: float, outer: float, out: Floats) -> None:
-    """Means of the maps (n, h, w) over the ring between two radii round (u, v); `out` (n,), 0 where it has no pixel."""
-    count, height, width = maps.shape
+def zones(maps: Floats, u: float, v: float, edges: Floats, out: Floats) -> None:
+    """Means of the maps (h, w, n) over zones round (u, v); `out` (m, n), 0 where a zone has no pixel.
+
+    `edges` (m,) are the zones' outer radii [px], growing; the first zone is a disc.
+    """
+    height, width, count = maps.shape
+    zones_n = edges.shape[0]
     out[:] = 0
-    n = 0
-    y0, y1 = max(int(v - outer), 0), min(int(v + outer) + 2, height)
-    x0, x1 = max(int(u - outer), 0), min(int(u + outer) + 2, width)
-    for y in range(y0, y1):
-        for x in range(x0, x1):
+    pixels = np.zeros(zones_n, np.int32)
+    outer = edges[-1]
+    for y in range(max(int(v - outer), 0), min(int(v + outer) + 2, height)):
+        for x in range(max(int(u - outer), 0), min(int(u + outer) + 2, width)):
             d = (x - u) * (x - u) + (y - v) * (y - v)
-            if inner * inner <= d <= outer * outer:
-                n += 1
-                for k in range(count):
-                    out[k] += maps[k, y, x]
-    if n > 0:
-        for k in range(count):
-            out[k] /= n
+            for z in range(zones_n):
+                if d <= edges[z] * edges[z]:
+                    pixels[z] += 1
+                    for k in range(count):
+                        out[z, k] += maps[y, x, k]
+                    break
+    for z in range(zones_n):
+        if pixels[z] > 0:
+            for k in range(count):
+                out[z, k] /= pixels[z]
 
 
 @njit(cache=True, fastmath=True)
 def describe(
-    maps: Floats, source: Floats, votes: Floats, points: Ints, family: int, radius_min: float, radius_max: float, out: Floats
+    maps: Floats,
+    source: Floats,
+    votes: Floats,
+    points: Ints,
+    family: int,
+    radii: tuple[float, float],
+    spokes: Floats,
+    out: Floats,
 ) -> None:
-    """What the filters say of each point (n, 2: x, y) of one pyramid level.
+    """What the filters say of each point (n, 2: x, y) of one pyramid level, its circle's radius sought between `radii` [px].
 
-    `maps` (7, h, w): red, green, brightness, whiteness, smoothness, area (of this family), highlight. `out`
-    (n, FEATURES): the features of `core.perception.filters.FEATURES`, in order, but the radius [px of the level] last.
+    `maps` (h, w, 8) are `core.perception.filters.MAPS`; `out` (n, FEATURES): `FEATURES`, but the radius [px] itself last.
     """
-    count = maps.shape[0]
-    inside, middle, ring = np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
+    within = np.zeros((5, maps.shape[2]), np.float32)
+    edges = np.zeros(5, np.float32)
     for i in range(points.shape[0]):
         u, v = float(points[i, 0]), float(points[i, 1])
-        radius, seen, step = outline(source, u, v, radius_min, radius_max)
-        disc_means(maps, u, v, 0.0, 0.9 * radius, inside)
-        disc_means(maps, u, v, 0.0, 0.5 * radius, middle)
-        disc_means(maps, u, v, 1.15 * radius, 1.5 * radius, ring)
-        out[i, 0] = inside[family]
+        radius, seen, step = outline(source, u, v, radii[0], radii[1], spokes)
+        for z in range(5):
+            edges[z] = radius * ZONES[z]
+        zones(maps, u, v, edges, within)
+        middle, rim, ring, further = within[0], within[1], within[3], within[4]
+        out[i, 0] = rim[family]
         out[i, 1] = middle[family]
         out[i, 2] = ring[family]
-        out[i, 3] = inside[1 - family]
-        out[i, 4] = inside[4]
-        out[i, 5] = ring[4]
-        out[i, 6] = inside[5]
-        out[i, 7] = votes[points[i, 1], points[i, 0]]
-        out[i, 8] = seen
-        out[i, 9] = step
-        out[i, 10] = middle[6]
-        out[i, 11] = inside[2]
-        out[i, 12] = inside[2] - ring[2]
-        out[i, 13] = inside[3]
-        out[i, 14] = radius
+        out[i, 3] = further[family]
+        out[i, 4] = (middle[1 - family] + rim[1 - family]) / 2
+        out[i, 5] = (middle[4] + rim[4]) / 2
+        out[i, 6] = ring[4]
+        out[i, 7] = (middle[6 + family] + rim[6 + family]) / 2
+        out[i, 8] = votes[points[i, 1], points[i, 0]]
+        out[i, 9] = seen
+        out[i, 10] = step
+        out[i, 11] = middle[5]
+        out[i, 12] = (middle[2] + rim[2]) / 2
+        out[i, 13] = out[i, 12] - ring[2]
+        out[i, 14] = (middle[3] + rim[3]) / 2
+        out[i, 15] = radius
+
+
+@njit(cache=True, fastmath=True)
+def tint(image: Bytes, red: Floats, u: float, v: float, half: float) -> Floats:
+    """Mean blue, green and red (3,), 0..255, of the square round (u, v); pixels weigh by how likely red fruit they are."""
+    height, width = red.shape
+    out = np.zeros(3, np.float32)
+    whole = np.float32(1e-6)
+    y0, x0 = min(max(int(v - half), 0), height - 1), min(max(int(u - half), 0), width - 1)
+    for y in range(y0, max(min(int(v + half) + 1, height), y0 + 1)):
+        for x in range(x0, max(min(int(u + half) + 1, width), x0 + 1)):
+            weight = red[y, x] + np.float32(1e-3)
+            whole += weight
+            for k in range(3):
+                out[k] += weight * image[y, x, k]
+    return out / whole
 
 
 @njit(cache=True)

@@ -47,20 +47,25 @@ STEEP = 0.10
 RADII_PX = (4, 8)
 """Of the circles voted for at each pyramid level; a level has half the size of the one before."""
 LEVELS = 5
+SPOKES = np.array([(math.cos(math.tau * k / 16), math.sin(math.tau * k / 16)) for k in range(16)], np.float32)
+"""Directions in which an outline is looked for."""
+AREA_SCALE = 0.55
+"""Pictures that shrink further are averaged over areas, others are interpolated."""
 VOTE_MIN = 0.30
 """Circle votes plus colour at a centre below which it is not looked at."""
-CANDIDATES_MAX = 70
+CANDIDATES_MAX = 50
 """A pyramid level and colour."""
 APART = 0.75
 """Of the larger radius: nearer centres are one fruit."""
 SURE_ENOUGH = 0.5
 
 FAMILIES: tuple[Colour, Colour] = ("red", "green")
-MAPS = ("red", "green", "brightness", "whiteness", "smooth", "area", "highlight")
+MAPS = ("red", "green", "brightness", "whiteness", "smooth", "highlight", "area_red", "area_green")
 FEATURES = (
-    "colour",
+    "colour_rim",
     "colour_middle",
     "colour_around",
+    "colour_further",
     "other_colour",
     "smooth",
     "smooth_around",
@@ -148,8 +153,8 @@ def stages(image: Image) -> dict[str, Image | Floats]:
     weights = packaged()
     seen = Seen(image, weights.balance_norm, colour_table(weights.colour))
     pictures: dict[str, Image | Floats] = {"balanced": np.clip(seen.image * seen.gains, 0, 255).astype(np.uint8)}
-    pictures |= {name: seen.maps[MAPS.index(name)].copy() for name in ("smooth", "red", "green", "highlight")}
-    pictures |= {f"area_{FAMILIES[k]}": seen.areas[k] for k in range(len(FAMILIES))}
+    looked_at = ("smooth", "red", "green", "highlight", "area_red", "area_green")
+    pictures |= {name: np.ascontiguousarray(seen.maps[:, :, MAPS.index(name)]) for name in looked_at}
     for k, name in enumerate(FAMILIES):
         pictures[f"circles_{name}"] = np.minimum(circle_votes(seen.maps, k)[1], 1)
         pictures[f"combined_{name}"] = np.zeros(seen.image.shape[:2], np.float32)
@@ -243,34 +248,35 @@ class Seen:
     def __init__(self, image: Image, balance_norm: float, table: Floats) -> None:
         self.scale = LONG_SIDE_PX / max(image.shape[:2])
         size = (max(round(image.shape[1] * self.scale), 16), max(round(image.shape[0] * self.scale), 16))
-        how = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_LINEAR
+        how = cv2.INTER_AREA if self.scale < AREA_SCALE else cv2.INTER_LINEAR
         self.image = np.asarray(cv2.resize(image, size, interpolation=how), np.uint8)
         self.gains = gains_of(self.image, balance_norm)
         values = np.clip(np.arange(256)[None] / 255 * self.gains[:, None], 0, 1)
         bins = np.minimum(values * BINS, BINS - 1).astype(np.uint8)
         luma = (values * np.array(BGR_LUMA)[:, None]).astype(np.float32)
-        self.maps = np.empty((len(MAPS), *self.image.shape[:2]), np.float32)
-        kernels.planes(self.image, bins, luma, table, self.maps[:4])
-        self.maps[4] = smoothness(self.maps[2])
-        self.maps[6] = highlights(self.maps[2], self.maps[3])
-        self.areas = [areas(self.maps[k], self.maps[4]) for k in range(len(FAMILIES))]
+        colours = np.empty((*self.image.shape[:2], 4), np.float32)
+        kernels.planes(self.image, bins, luma, table, colours)
+        self.red, green, brightness, whiteness = (np.ascontiguousarray(colours[:, :, k]) for k in range(4))
+        smooth = smoothness(brightness)
+        rest = (smooth, highlights(brightness, whiteness), areas(self.red, smooth), areas(green, smooth))
+        self.maps: Floats = np.concatenate([colours, np.asarray(cv2.merge(rest), np.float32)], axis=2)
+        """(h, w, MAPS)"""
 
     def candidates(self) -> Iterator[Candidates]:
-        """Where circles and colour agree, for each colour and size."""
-        for family in range(len(FAMILIES)):
-            self.maps[5] = self.areas[family]
-            maps, zoom = self.maps, 1.0
-            for _ in range(LEVELS):
+        """Where circles and colour agree, for each size and colour."""
+        maps, zoom = self.maps, 1.0
+        for _ in range(LEVELS):
+            for family in range(len(FAMILIES)):
                 yield self._level(maps, family, zoom)
-                if min(maps.shape[1:]) < 4 * RADII_PX[1]:
-                    break
-                maps, zoom = halved(maps), zoom * 2
+            if min(maps.shape[:2]) < 4 * RADII_PX[1]:
+                break
+            maps, zoom = kernels.halve(maps), zoom * 2
 
     def _level(self, maps: Floats, family: int, zoom: float) -> Candidates:
         source, votes = circle_votes(maps, family)
-        points = peaks(votes)
+        points = kernels.tops(votes, VOTE_MIN, CANDIDATES_MAX)
         found = np.empty((len(points), len(FEATURES)), np.float32)
-        kernels.describe(maps, source, votes, points, family, RADII_PX[0] * 0.8, RADII_PX[1] * 1.3, found)
+        kernels.describe(maps, source, votes, points, family, (RADII_PX[0] * 0.8, RADII_PX[1] * 1.3), SPOKES, found)
         radius = found[:, -1] * zoom
         found[:, -1] = np.log(radius)
         circles = np.column_stack([(points + 0.5) * zoom, radius]) / self.scale
@@ -278,14 +284,8 @@ class Seen:
 
     def tint(self, circle: Floats) -> NDArray[np.float64]:
         """Log of red over green and of blue over green (2,) in the middle of a circle, balanced."""
-        u, v, radius = circle * self.scale
-        half = max(radius * 0.6, 1.0)
-        height, width = self.image.shape[:2]
-        rows = slice(int(np.clip(v - half, 0, height - 1)), int(np.clip(v + half + 1, 1, height)))
-        columns = slice(int(np.clip(u - half, 0, width - 1)), int(np.clip(u + half + 1, 1, width)))
-        pixels = self.image[rows, columns].reshape(-1, 3) / 255 * self.gains
-        weight = self.maps[0, rows, columns].reshape(-1, 1) + 1e-3
-        b, g, r = (pixels * weight).sum(axis=0) / weight.sum()
+        u, v, radius = (float(value) for value in circle * self.scale)
+        b, g, r = kernels.tint(self.image, self.red, u, v, max(radius * 0.6, 1.0)) / 255 * self.gains
         return np.array([math.log((r + 0.02) / (g + 0.02)), math.log((b + 0.02) / (g + 0.02))])
 
 
@@ -316,26 +316,10 @@ def areas(plane: Floats, smooth: Floats) -> Floats:
 
 def circle_votes(maps: Floats, family: int) -> tuple[Floats, Floats]:
     """The plane whose discs are looked for (colour, brighter in the middle), and the votes for their centres (h, w)."""
-    source = np.ascontiguousarray(maps[family] * (0.35 + 0.65 * np.minimum(maps[2], 1)))
+    plane = np.ascontiguousarray(maps[:, :, family])
+    source = plane * (np.float32(0.35) + np.float32(0.65) * maps[:, :, 2])
     source = np.asarray(cv2.GaussianBlur(source, (3, 3), 0.8), np.float32)
     votes = np.empty_like(source)
     kernels.vote(source, STEEP, *RADII_PX, votes)
-    colour = cv2.blur(maps[family], (5, 5))
-    return source, np.asarray(cv2.GaussianBlur(votes, (5, 5), 1.2) * 4 + 0.5 * colour, np.float32)
-
-
-def peaks(votes: Floats) -> NDArray[np.int32]:
-    """Local maxima (n, 2: x, y) that have enough votes, the strongest first."""
-    tops = (votes >= VOTE_MIN) & (votes >= cv2.dilate(votes, np.ones((5, 5), np.uint8)))
-    ys, xs = np.nonzero(tops)
-    order = np.argsort(-votes[ys, xs], kind="stable")[:CANDIDATES_MAX]
-    return np.ascontiguousarray(np.column_stack([xs[order], ys[order]]).astype(np.int32))
-
-
-def halved(maps: Floats) -> Floats:
-    """The maps (n, h, w) at half their size."""
-    height, width = maps.shape[1] // 2, maps.shape[2] // 2
-    cut = maps[:, : 2 * height, : 2 * width]
-    return np.ascontiguousarray(
-        (cut[:, ::2, ::2] + cut[:, 1::2, ::2] + cut[:, ::2, 1::2] + cut[:, 1::2, 1::2]) * np.float32(0.25)
-    )
+    smoothed = np.asarray(cv2.GaussianBlur(votes, (5, 5), 1.2), np.float32)
+    return source, np.asarray(cv2.addWeighted(smoothed, 4.0, cv2.blur(plane, (5, 5)), 0.5, 0.0), np.float32)

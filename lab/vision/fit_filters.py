@@ -347,5 +347,4 @@ def _ripe(samples: Sequence[Sample], seen: Sequence[Seen]) -> Array:
             tints.append(np.concatenate([[1.0], one.tint(circle)]))
             red.append(int(box.label == "red"))
     y = np.array(red)
-    weight = np.where(y == 1, 1 / max(y.sum(), 1), 1 / max((1 - y).sum(), 1)) * len(y)
-    return _logistic_fit(np.array(tints), y, weight, 1e-4)
+    return _logistic_fit(np.array(tints), y, np.ones(len(y)), 1e-4)
