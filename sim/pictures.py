@@ -95,11 +95,11 @@ class Pictures:
         def job() -> bytes:
             from sim.camera import hand, overview
 
+            camera, sensor = hand.camera(width, height), hand.Sensor(exposure=overexposure)
             light = hand.light_of(lamps_m, hand.LAMP_RGB[tint], hand.nearest_lamp(lamps_m, T_world_cam))
             if "camera_black" in broken:
-                light = hand.DARK
-            sensor = hand.Sensor(exposure=overexposure)
-            picture = hand.draw(hand.camera(width, height), T_world_cam, geoms, paint, light, sensor, seed)
+                return overview.jpeg(hand.covered(camera, sensor, seed))
+            picture = hand.draw(camera, T_world_cam, geoms, paint, light, sensor, seed)
             if "camera_upside_down" in broken:
                 picture = np.ascontiguousarray(picture[::-1, ::-1])
             return overview.jpeg(picture)

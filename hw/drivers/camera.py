@@ -38,8 +38,8 @@ SILENCE_S = 3.0
 """A camera that gives no picture for so long is silent."""
 SAME_MAX, AGAIN_S = 3, 0.15
 """So many equal pictures in a row, this far apart, are a frozen camera."""
-BLACK_MEAN, BLACK_BRIGHT = 8.0, 32.0
-"""A picture is black when neither its mean nor the brightest hundredth of it exceeds these (0-255)."""
+BLACK_LEVEL, BLOCK_PX = 24.0, 8
+"""A picture is black when no block of so many pixels is brighter on average (0-255): a covered sensor still has noise."""
 BURNT_LEVEL, BURNT_SHARE = 250, 0.5
 """A picture is burnt out when more than this share of it is as bright as this."""
 PICTURE_BYTES_MAX = 16 * 1024 * 1024
@@ -186,9 +186,10 @@ def decoded(data: bytes) -> Image:
 
 
 def unfit(image: Image) -> None:
-    """Raises CameraUnfit for a picture (H, W, 3) that is black or burnt out. A sixteenth of the pixels tells."""
-    grey = image[::4, ::4].max(axis=2)
-    if grey.mean() < BLACK_MEAN and np.percentile(grey, 99) < BLACK_BRIGHT:
+    """Raises CameraUnfit for a picture (H, W, 3) that is black or burnt out."""
+    rows, columns = image.shape[0] // BLOCK_PX * BLOCK_PX, image.shape[1] // BLOCK_PX * BLOCK_PX
+    bright = image[:rows, :columns].max(axis=2).reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
+    if bright.mean(axis=(1, 3)).max(initial=0.0) < BLACK_LEVEL:
         raise CameraUnfit(CameraState.BLACK, "the picture is black; is the lens covered?")
     if (image[::4, ::4].min(axis=2) >= BURNT_LEVEL).mean() > BURNT_SHARE:
         raise CameraUnfit(CameraState.OVEREXPOSED, "the picture is burnt out: too much light, or a stuck exposure")

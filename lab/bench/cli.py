@@ -18,6 +18,7 @@ from lab.reproduce import load_object
 BENCHES = {
     "world": "lab.bench.world:bench_world",
     "wavefront": "lab.bench.wavefront:bench_wavefront",
+    "camera": "lab.bench.camera:bench_camera",
     "pot": "lab.bench.pot:bench_pot",
     "broadcast": "lab.bench.broadcast:bench_broadcast",
     "detector": "lab.bench.detector:bench_detector",

@@ -107,6 +107,15 @@ def garden_frames(group: str, count: int, seed: list[int]) -> Iterator[Frame]:
         yield Frame(picture=picture, labels=entry | {"boxes": _boxes(view, raster, fruit)}, T_world_cam=view.T_world_cam)
 
 
+def views(count: int, seed: int, size: tuple[int, int]) -> Iterator[tuple[World, View]]:
+    """`count` views of one size in one garden, and the world as it stands for each."""
+    rng = np.random.default_rng([seed])
+    world = World(_scenario(rng), int(rng.integers(2**31)))
+    fruit = _fruit_of(world, rng)
+    for _ in range(count):
+        yield world, _view(world, fruit, size, rng)
+
+
 def _scenario(rng: np.random.Generator) -> Scenario:
     """The paper's garden with other plants; its first robot will be docked."""
     scenario = find("garden")

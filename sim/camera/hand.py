@@ -58,10 +58,6 @@ class Sensor:
     """Sigma of a dark and of a white pixel at a gain of one."""
 
 
-DARK = Light(lamps=(), ambient_rgb=(0.0, 0.0, 0.0), sky_rgb=(0.0, 0.0, 0.0))
-"""With something before the lens."""
-
-
 def camera(width: int, height: int, distortion: Distortion = NO_DISTORTION) -> Camera:
     """The gardener's camera, read out at this size."""
     return from_fov(*CAMERA_PIXELS, math.radians(CAMERA_FOV_Y_DEG), distortion).scaled(width, height)
@@ -136,6 +132,12 @@ def depth_png(camera: Camera, T_world_cam: Floats, geoms: Geoms) -> bytes:
 def _ahead(T_world_cam: Floats) -> Floats:
     ahead: Floats = T_world_cam[:3, 3] + SHADOW_AHEAD_M * T_world_cam[:3, 2]
     return ahead
+
+
+def covered(camera: Camera, sensor: Sensor = Sensor(), seed: int = 0) -> Picture:
+    """The picture with something before the lens: the sensor's own noise."""
+    shape = (camera.height, camera.width)
+    return develop(np.zeros((*shape, 3), dtype=np.float32), np.full(shape, np.inf), Light(lamps=()), sensor, seed)
 
 
 def develop(film: Linear, distance_m: Floats, light: Light, sensor: Sensor, seed: int) -> Picture:

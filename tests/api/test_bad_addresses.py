@@ -165,4 +165,5 @@ def test_strange_event_ids_do_no_harm(doors: Doors) -> None:
 
 def test_a_picture_of_nobody_is_404(doors: Doors) -> None:
     for name in ("nobody", "plant-1", "x" * 41, "..%2F..%2Fhand"):
-        check_problem(doors.ask("sim", "GET", f"/cameras/{name}/hand.jpg"), name, 404, 422)
+        for form in ("jpg", "mjpg", "png"):
+            check_problem(doors.ask("sim", "GET", f"/cameras/{name}/hand.{form}"), name, 404, 422)

@@ -123,7 +123,7 @@ def test_a_frozen_camera_is_known_from_the_first_look_on_and_again_after_it_was_
 @pytest.mark.parametrize(
     ("shown", "state"),
     [
-        (lambda n: picture(n, 1.0, 1.5), CameraState.BLACK),
+        (lambda n: picture(n, 5.0, 9.0), CameraState.BLACK),
         (lambda n: picture(0, 0.0, 0.0), CameraState.BLACK),
         (lambda n: picture(n, 300.0, 30.0), CameraState.OVEREXPOSED),
     ],
