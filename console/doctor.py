@@ -12,6 +12,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
+from ctypes.util import find_library
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -54,12 +55,23 @@ def _machine() -> Iterator[Finding]:
     fits = (3, 11) <= sys.version_info[:2] < (3, 14)
     yield Finding("python", "ok" if fits else "bad", f"{platform.python_version()} (3.11 to 3.13 is right)")
     yield Finding("processors", "ok" if (os.cpu_count() or 1) >= 2 else "note", f"{os.cpu_count()}")
-    yield Finding("drawing", "ok", "built-in rasteriser; no GL library is needed")
+    yield _drawing()
     docker = shutil.which("docker")
     told = (
         f"{docker}, DOCKER_HOST={os.environ.get('DOCKER_HOST') or 'default'}" if docker else "not found (only for compose)"
     )
     yield Finding("docker", "ok" if docker else "note", told)
+
+
+def _drawing() -> Finding:
+    """What draws the cameras of a simulated garden; the overview is always ours."""
+    if os.environ.get("MUJOCO_GL", "").lower() != "egl":
+        return Finding("drawing", "ok", "built-in rasteriser; MUJOCO_GL=egl would draw the cameras with MuJoCo's renderer")
+    needed = {"libEGL": find_library("EGL"), "PyOpenGL": importlib.util.find_spec("OpenGL")}
+    missing = [name for name, found in needed.items() if found is None]
+    if missing:
+        return Finding("drawing", "note", f"built-in rasteriser, though MUJOCO_GL=egl: {' and '.join(missing)} not found")
+    return Finding("drawing", "ok", "cameras on EGL by MuJoCo, as MUJOCO_GL says; the overview by the built-in rasteriser")
 
 
 def _packages() -> Iterator[Finding]:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from core.clock import Clock
 from core.errors import NotFound, Unavailable
@@ -33,6 +36,7 @@ class Pictures:
         self._last: dict[tuple[str, int, int], bytes] = {}
         """The hands' last pictures, by robot and size: what a frozen camera repeats."""
         self._taken = 0
+        self._egl: Any = None
 
     async def overview(self) -> bytes:
         """The garden from above as JPEG; askers at about the same time get the same picture."""
@@ -88,6 +92,7 @@ class Pictures:
         geoms, T_world_cam = self._seen(robot_id)
         paint, faults = repaint(self._paint, self._rig.world.model), self._robot(robot_id).faults
         broken, overexposure = faults.camera, faults.overexposure
+        plain = self._egl_film(robot_id, width, height)
         lamps_m, tint = np.array(self._rig.world.data.light_xpos), self._rig.world.scenario.arena.lamps
         self._taken += 1
         seed = self._taken
@@ -99,12 +104,27 @@ class Pictures:
             light = hand.light_of(lamps_m, hand.LAMP_RGB[tint], hand.nearest_lamp(lamps_m, T_world_cam))
             if "camera_black" in broken:
                 return overview.jpeg(hand.covered(camera, sensor, seed))
-            picture = hand.draw(camera, T_world_cam, geoms, paint, light, sensor, seed)
+            if plain is None:
+                picture = hand.draw(camera, T_world_cam, geoms, paint, light, sensor, seed)
+            else:
+                picture = hand.develop(plain(), np.full((height, width), sensor.focus_m), light, sensor, seed)
             if "camera_upside_down" in broken:
                 picture = np.ascontiguousarray(picture[::-1, ::-1])
             return overview.jpeg(picture)
 
         return job
+
+    def _egl_film(self, robot_id: str, width: int, height: int) -> Callable[[], npt.NDArray[np.float32]] | None:
+        """How MuJoCo's own renderer would draw this instant, if it was chosen."""
+        if os.environ.get("MUJOCO_GL", "").lower() != "egl":
+            return None
+        from sim.camera import egl
+
+        if not egl.chosen():
+            return None
+        if self._egl is None:
+            self._egl = egl.EglEye(self._rig.world.model)
+        return partial(self._egl.draw, egl.instant_of(self._rig.world.data), f"{robot_id}/eye", width, height)
 
     def _depth_job(self, robot_id: str, width: int, height: int) -> Callable[[], bytes]:
         geoms, T_world_cam = self._seen(robot_id)

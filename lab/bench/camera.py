@@ -7,12 +7,9 @@ EGL is MuJoCo's own renderer, with its shadows: a plainer picture.
 
 from __future__ import annotations
 
-import importlib.util
-import os
 import statistics
 import time
 from collections.abc import Callable
-from ctypes.util import find_library
 from functools import partial
 from typing import Any
 
@@ -22,6 +19,7 @@ import numpy as np
 from core.geometry.pinhole import directions
 from lab.vision.rendered import View, views
 from sim.camera import hand
+from sim.camera.egl import EglEye, chosen, instant_of
 from sim.camera.raster import rasterise
 from sim.world import World
 
@@ -40,13 +38,16 @@ def bench_camera(n: int = 5) -> list[Row]:
 
 def bench_size(size: tuple[int, int], n: int) -> list[Row]:
     """The raster, and the whole frame, of `n` views of a docked robot."""
-    egl = Egl(size) if Egl.there() else None
+    egl: EglEye | None = None
     raster: list[tuple[float, float]] = []
     frame: list[tuple[float, float | None]] = []
     for world, view in views(n, SEED, size):
         ours = partial(rasterise, view.camera, view.T_world_cam, view.geoms)
         whole = partial(hand.draw, view.camera, view.T_world_cam, view.geoms, view.paint, view.light, view.sensor)
-        theirs = None if egl is None else partial(egl.draw, world)
+        if chosen() and egl is None:
+            egl = EglEye(world.model)
+        name = f"{next(iter(world.robots))}/eye"
+        theirs = None if egl is None else partial(egl.draw, instant_of(world.data), name, *size)
         for work in (whole, theirs):
             if work is not None:
                 work()
@@ -90,30 +91,3 @@ def _rays(world: World, view: View) -> Callable[[], None]:
         mujoco.mj_multiRay(model, data, eye, rays, groups, 1, -1, ids, distance_m, normal, count, mujoco.mjMAXVAL)
 
     return cast
-
-
-class Egl:
-    """MuJoCo's own renderer on the machine's EGL."""
-
-    def __init__(self, size: tuple[int, int]) -> None:
-        self._size = size
-        self._renderer: tuple[World, Any] | None = None
-
-    @staticmethod
-    def there() -> bool:
-        """Chosen with MUJOCO_GL=egl, and installed."""
-        chosen = os.environ.get("MUJOCO_GL", "").lower() == "egl"
-        return chosen and find_library("EGL") is not None and importlib.util.find_spec("OpenGL") is not None
-
-    def draw(self, world: World) -> None:
-        if self._renderer is None or self._renderer[0] is not world:
-            self.close()
-            self._renderer = world, mujoco.Renderer(world.model, self._size[1], self._size[0])
-        renderer = self._renderer[1]
-        renderer.update_scene(world.data, camera=f"{next(iter(world.robots))}/eye")
-        renderer.render()
-
-    def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer[1].close()
-            self._renderer = None
