@@ -24,17 +24,33 @@ READY_M = 0.05
 RETREAT_M = 0.09
 """Straight back with the fruit, until nothing hangs between the fingers and the plant."""
 STEP_M = 0.015
-OPENING_SLACK_M = 0.009
+OPENING_SLACK_M = 0.007
 """The fingers open this much wider than the fruit on either side: room for error, none for its neighbour."""
 PITCHES_RAD = tuple(math.radians(d) for d in (0, 10, -10, 20, -20, 30, -30, 40, -40, 50, -50, 60))
-FINGER_M = 0.010
-"""Thickness of a finger outside the opening."""
-FINGER_HALF_HEIGHT_M = 0.014
-FINGER_TIP_M = 0.016
-"""The pads reach this far beyond the tool point."""
-CAMERA_BOTTOM_M, CAMERA_TOP_M, CAMERA_HALF_WIDTH_M = 0.028, 0.062, 0.020
+ROOM_M_MIN = -0.006
+"""A fruit gives way by so much on its stalk and comes to no harm; with less room the hand stays away."""
 ROOM_ENOUGH_M = 0.012
 """More room than this to a neighbour is worth nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """A part of the hand as a box in the tool's frame, reaching forward to `front_m`; beside the opening or not."""
+
+    front_m: float
+    half_width_m: float
+    beside_opening: bool
+    low_m: float
+    high_m: float
+
+
+HAND_PARTS = (
+    Part(front_m=0.014, half_width_m=0.008, beside_opening=True, low_m=-0.012, high_m=0.012),
+    Part(front_m=-0.010, half_width_m=0.014, beside_opening=True, low_m=-0.006, high_m=0.006),
+    Part(front_m=-0.075, half_width_m=0.011, beside_opening=False, low_m=-0.022, high_m=0.011),
+    Part(front_m=-0.100, half_width_m=0.018, beside_opening=False, low_m=0.030, high_m=0.060),
+)
+"""Pads, rails, palm with the hose, camera."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,12 +114,14 @@ def room_m(fruit: Point3, pitch_rad: float, opening_m: float, others: Sequence[O
     least = math.inf
     for other in others:
         x, y, z = _in_hand(fruit, bearing, pitch_rad, other.centre)
-        if x > FINGER_TIP_M + other.radius_m or x < -LOOK_M - HAND_M:
-            continue
-        fingers = _off(abs(y) - opening_m / 2 - FINGER_M, abs(z) - FINGER_HALF_HEIGHT_M)
-        housing_z = abs(z - (CAMERA_BOTTOM_M + CAMERA_TOP_M) / 2) - (CAMERA_TOP_M - CAMERA_BOTTOM_M) / 2
-        housing = _off(abs(y) - CAMERA_HALF_WIDTH_M, housing_z) if x < -0.10 else math.inf
-        least = min(least, min(fingers, housing) - other.radius_m)
+        for part in HAND_PARTS:
+            ahead = x - part.front_m
+            if ahead > other.radius_m or ahead < -LOOK_M - HAND_M:
+                continue
+            half_y = part.half_width_m + (opening_m / 2 if part.beside_opening else 0.0)
+            middle, half_z = (part.low_m + part.high_m) / 2, (part.high_m - part.low_m) / 2
+            off = _off(abs(y) - half_y, abs(z - middle) - half_z)
+            least = min(least, math.hypot(max(off, 0.0), ahead) - other.radius_m if ahead > 0 else off - other.radius_m)
     return least
 
 

@@ -73,7 +73,7 @@ async def _trial(seed: int, detector: str, folder: Path) -> Trial:
         before = hanging(garden)
         known = (await garden.get(PLANT, "/inventory?colour=red"))["fruits"]
         pose = garden.truth().robot(ROBOT).pose
-        reach = {fruit.id for fruit in before if fruit.colour == "red" and reachable(pose, fruit)}
+        reach = reachable(pose, before)
         named = {fruit_id: known[index]["fruit_id"] for index, fruit_id, _ in matched(known, before).pairs}
         wanted = {fruit_id: named[fruit_id] for fruit_id in sorted(reach) if fruit_id in named}
         picks: dict[str, dict[str, Any]] = {}
@@ -98,7 +98,7 @@ def _judged(
         said = pick.get("reason") or ("the robot says picked" if pick.get("outcome") == "picked" else "never tried")
         cause = "" if picked else f"{now.where}: {said}"
         tried.append(Tried(fruit_id=fruit_id, picked=picked, took_s=pick.get("took_s", math.nan), cause=cause))
-    others = [f for f in fruit.values() if f.torn_by is not None and f.id not in wanted]
+    others = [f for f in fruit.values() if f.torn_by is not None and (f.torn_how == "touch" or f.id not in wanted)]
     green = sum(f.colour == "green" for f in others)
     return Trial(
         seed=seed,

@@ -17,6 +17,7 @@ from core.manipulation.approach import (
     LOOK_M,
     READY_M,
     RETREAT_M,
+    ROOM_M_MIN,
     Approach,
     Obstacle,
     approaches,
@@ -51,8 +52,9 @@ PLACES_MAX = 2
 SHIFT_MPS, SHIFT_RADPS, SHIFT_S, SHIFT_SHARE = 0.08, 0.15, 2.0, 0.7
 NEAR_SIDE_M, NEAR_DEPTH_M = 0.004, 0.008
 """The servo is content when the fruit is this near to the middle between the fingers, and to its distance."""
-FAR_OFF_M = 0.03
-"""A fruit this far from where the inventory has it is another one."""
+FAR_OFF_M, FAR_OFF_SIGMAS = 0.016, 1.5
+"""A fruit further than this from where the inventory has it, or than so many of its standard deviations beyond, is another
+one: neighbours hang two to four centimetres apart."""
 HELD_N = 0.8
 """Squeeze above which something is between the fingers."""
 GRIP_N_MAX = 9.0
@@ -150,11 +152,14 @@ async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit]) -> Pick:
             if place:
                 break
             return Pick(fruit_id=fruit.fruit_id, outcome="unreachable", reason=str(error)[:500])
+        ways = [way for way in ways if way.room_m >= ROOM_M_MIN]
+        if not ways:
+            return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason="other fruit hangs in the way of the hand")
         for way in ways[:WAYS_MAX]:
             target = _expected(task, fruit)
             try:
                 await _swing(task.robot, way.look, way.opening_m)
-                why = await servo(task.robot, way.pitch_rad, target, fruit.colour, _place(task, fruit))
+                why = await servo(task.robot, way.pitch_rad, target, fruit, _place(task, fruit))
             except Refused as error:
                 why = reason_unless_halted(error)
             if not why:
@@ -189,7 +194,7 @@ async def _shift(robot: Robot, side_m: float) -> None:
     await robot.pause(SETTLE_S)
 
 
-async def servo(robot: Robot, pitch_rad: float, target: Target, colour: str, place: Point3) -> str:
+async def servo(robot: Robot, pitch_rad: float, target: Target, fruit: Fruit, place: Point3) -> str:
     """Bring the hand to `READY_M` before the fruit by what the camera sees; why it did not, or empty.
 
     Image-based: the features' error through the inverse interaction matrix gives the camera's next step; the distance in
@@ -199,7 +204,7 @@ async def servo(robot: Robot, pitch_rad: float, target: Target, colour: str, pla
     for _ in range(LOOKS_MAX):
         look = await robot.eye.look()
         T_base_cam = camera_pose(joints_now(robot))
-        circle = best_match(robot, look.detections, target, T_base_cam, colour)
+        circle = best_match(robot, look.detections, target, T_base_cam, fruit.colour)
         if circle is None:
             blind += 1
             if blind > BLIND_MAX:
@@ -207,7 +212,7 @@ async def servo(robot: Robot, pitch_rad: float, target: Target, colour: str, pla
             continue
         blind = 0
         target.see(robot.eye.camera, T_base_cam, np.array([circle.u_px, circle.v_px, circle.radius_px]))
-        if float(np.linalg.norm(target.p_base - np.array(place))) > FAR_OFF_M + DOCKING_SIGMA_M:
+        if float(np.linalg.norm(target.p_base - np.array(place))) > FAR_OFF_M + FAR_OFF_SIGMAS * fruit.sigma_m:
             return "what the camera sees hangs too far from where the inventory has the fruit"
         gap = T_base_cam[:3, :3].T @ (target.p_base - T_base_cam[:3, 3]) - GOAL_IN_CAMERA_M
         if np.hypot(gap[0], gap[1]) < NEAR_SIDE_M and abs(gap[2]) < NEAR_DEPTH_M:
@@ -279,7 +284,7 @@ async def _take(task: Task, fruit: Fruit, way: Approach, target: Target) -> Pick
         why = "nothing was held: the force sensor felt no fruit"
         await _go_along(robot, _reversed_way(target, way), PULL_SHARE, opening_for(target.radius_m))
         try:
-            lost = await servo(robot, way.pitch_rad, target, fruit.colour, _place(task, fruit))
+            lost = await servo(robot, way.pitch_rad, target, fruit, _place(task, fruit))
         except Refused as error:
             lost = reason_unless_halted(error)
         if lost:
