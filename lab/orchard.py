@@ -10,7 +10,7 @@ import numpy as np
 
 from core.errors import Refused
 from core.geometry.pinhole import Camera, from_fov, sphere_outline
-from core.manipulation.approach import Obstacle, approaches
+from core.manipulation.approach import approaches
 from core.manipulation.eye import camera_pose, scan_poses
 from core.manipulation.kinematics import Array
 from core.robots import gardener
@@ -63,27 +63,13 @@ def in_base(pose: Pose2, fruit: FruitTruth) -> tuple[float, float, float]:
     return float(q[0]), float(q[1]), float(q[2])
 
 
-def reachable(pose: Pose2, hanging: list[FruitTruth], colour: str = "red") -> set[str]:
-    """Fruit of a colour that can be picked, one after another, without a collision.
-
-    Joints must exist that bring the hand straight to the fruit's true place, clear of pot, dock, body and of every fruit
-    that still hangs then; what was picked before is no longer in the way.
-    """
-    left = {fruit.id: fruit for fruit in hanging}
-    while True:
-        free = [f for f in left.values() if f.colour == colour and _clear(pose, f, [o for o in left.values() if o is not f])]
-        if not free:
-            return {fruit.id for fruit in hanging} - set(left)
-        for fruit in free:
-            del left[fruit.id]
-
-
-def _clear(pose: Pose2, fruit: FruitTruth, others: list[FruitTruth]) -> bool:
-    obstacles = [Obstacle(centre=in_base(pose, other), radius_m=other.radius_m) for other in others]
+def reachable(pose: Pose2, fruit: FruitTruth) -> bool:
+    """Whether joints exist that bring the hand straight to the fruit's true place, clear of pot, dock and body."""
     try:
-        return approaches(in_base(pose, fruit), fruit.radius_m, obstacles)[0].room_m >= 0.0
+        approaches(in_base(pose, fruit), fruit.radius_m, [])
     except Refused:
         return False
+    return True
 
 
 def visible(world: World, pose: Pose2, hanging: list[FruitTruth]) -> set[str]:

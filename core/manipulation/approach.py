@@ -24,9 +24,9 @@ READY_M = 0.05
 RETREAT_M = 0.09
 """Straight back with the fruit, until nothing hangs between the fingers and the plant."""
 STEP_M = 0.015
-OPENING_SLACK_M = 0.007
+OPENING_SLACK_M = 0.006
 """The fingers open this much wider than the fruit on either side: room for error, none for its neighbour."""
-PITCHES_RAD = tuple(math.radians(d) for d in (0, 10, -10, 20, -20, 30, -30, 40, -40, 50, -50, 60))
+PITCHES_RAD = tuple(math.radians(d) for d in range(-54, 73, 6))
 ROOM_M_MIN = -0.006
 """A fruit gives way by so much on its stalk and comes to no harm; with less room the hand stays away."""
 ROOM_ENOUGH_M = 0.012

@@ -73,7 +73,7 @@ async def _trial(seed: int, detector: str, folder: Path) -> Trial:
         before = hanging(garden)
         known = (await garden.get(PLANT, "/inventory?colour=red"))["fruits"]
         pose = garden.truth().robot(ROBOT).pose
-        reach = reachable(pose, before)
+        reach = {fruit.id for fruit in before if fruit.colour == "red" and reachable(pose, fruit)}
         named = {fruit_id: known[index]["fruit_id"] for index, fruit_id, _ in matched(known, before).pairs}
         wanted = {fruit_id: named[fruit_id] for fruit_id in sorted(reach) if fruit_id in named}
         picks: dict[str, dict[str, Any]] = {}
