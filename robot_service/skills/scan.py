@@ -21,6 +21,8 @@ from robot_service.skills.plantframe import base_in_plant, mapped, plant_in_base
 FUSE_COST_S = 0.02
 RANGE_M_MAX = 0.9
 RANGE_M_MIN = 0.08
+PLANT_RADIUS_M, PLANT_M = 0.27, (0.02, 1.3)
+"""The room that a plant takes: round its stem, above its soil."""
 MARGIN_RATIO = 0.9
 """Only what lies this far inside the picture counts as seen or missed: at the edge a fruit is cut."""
 
@@ -61,7 +63,7 @@ def document(robot: Robot, plant: PlantCard, scan_id: str, task_id: str, views: 
     camera, pose = robot.eye.camera, base_in_plant(robot.pose(), plant)
     half_x = math.atan(MARGIN_RATIO * camera.width / 2 / camera.fx)
     half_y = math.atan(MARGIN_RATIO * camera.height / 2 / camera.fy)
-    best = sorted(seen, key=lambda fruit: -fruit.confidence)[:FRUITS_MAX]
+    best = sorted(filter(_on_the_plant, seen), key=lambda fruit: -fruit.confidence)[:FRUITS_MAX]
     return Scan(
         scan_id=scan_id,
         task_id=task_id,
@@ -85,6 +87,12 @@ def document(robot: Robot, plant: PlantCard, scan_id: str, task_id: str, views: 
         ],
         detector=robot.eye.accuracy,
     )
+
+
+def _on_the_plant(fruit: Seen) -> bool:
+    """What hangs anywhere else is another plant's fruit, or no fruit at all."""
+    x_m, y_m, z_m = (float(value) for value in fruit.p)
+    return math.hypot(x_m, y_m) < PLANT_RADIUS_M and PLANT_M[0] < z_m < PLANT_M[1]
 
 
 def _view(T_plant_cam: Array, fov_x_rad: float, fov_y_rad: float) -> View:
