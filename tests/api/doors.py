@@ -34,7 +34,7 @@ LOOKED_AT = {
     "sim": ("/faults", "/clock"),
     "console": (),
 }
-ENDLESS = {"/events", "/clock/feed", "/cameras/{robot}/hand.mjpg"}
+ENDLESS = {"/events", "/clock/feed", "/cameras/{robot}/hand.mjpg", "/camera.mjpg"}
 """They stream for ever: only asked for with something wrong."""
 
 

@@ -38,7 +38,7 @@ MAY: dict[tuple[str, str, str], set[str] | str] = {
     ("station", "POST", "/dock/reservations"): ROBOT,
     ("station", "DELETE", "/dock/reservations/{reservation_id}"): KEEPERS,
     **{("robot", "GET", path): ANYBODY for path in ("/state", "/position", "/tasks", "/tasks/{task_id}", "/history")},
-    **{("robot", "GET", path): ANYBODY for path in ("/jobs", "/jobs/{job_id}")},
+    **{("robot", "GET", path): ANYBODY for path in ("/jobs", "/jobs/{job_id}", "/camera.jpg", "/camera.mjpg")},
     ("robot", "POST", "/bids"): PLANT,
     ("robot", "POST", "/tasks"): PLANT,
     ("robot", "DELETE", "/tasks/{task_id}"): PLANT,
