@@ -24,6 +24,8 @@ DRY_RATIO, MOIST_RATIO = 0.175, 0.35
 DOSE_ML = 90.0
 """Twelve seconds of pumping: the soil of three litres rises by three hundredths, beyond the target."""
 SOAK_S = 40.0
+WATER_ONLY = {"PLANT_INVENTORY": "false", "PLANT_HARVEST": "false"}
+"""Of a pot that asks neither for scans nor for picks."""
 PUMP_ERROR_RATIO = 0.04
 STOP_WITHIN_S = 0.3
 TICK_S = 0.02
@@ -65,10 +67,14 @@ def one_pot(**changes: Any) -> Scenario:
 
 @asynccontextmanager
 async def growing(scenario: Scenario, seed: int | None = None, **more: Any) -> AsyncIterator[Garden]:
-    """The garden in a folder of its own, with a short soak; what a service died of is raised at the end."""
-    soak = {plant.id: {"PLANT_SOAK_S": f"{SOAK_S:g}"} for plant in scenario.plants}
+    """The garden in a folder of its own, with a short soak, its pots asking for water only.
+
+    What a service died of is raised at the end.
+    """
+    care = WATER_ONLY | {"PLANT_SOAK_S": f"{SOAK_S:g}"}
+    pots = {plant.id: care for plant in scenario.plants}
     with tempfile.TemporaryDirectory() as folder:
-        async with Garden(scenario, Path(folder), seed=seed, settings=soak, **more) as garden:
+        async with Garden(scenario, Path(folder), seed=seed, settings=pots, **more) as garden:
             yield garden
             garden.check()
 

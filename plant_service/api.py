@@ -9,12 +9,13 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from core.errors import Forbidden
+from core.growth.stages import DAY_S
 from core.history import as_csv
 from core.mesh.auth import Caller
-from core.mesh.chassis import allow, body, serve_direct, serve_ready
+from core.mesh.chassis import allow, body, raw, serve_direct, serve_ready
 from core.mesh.guard import header
 from core.wire.documents import HistoryEntry
-from core.wire.fruit import Colour, Fruit, Inventory, NewFruit, Scan
+from core.wire.fruit import Colour, Forecast, Fruit, Inventory, LedgerLine, NewFruit, Scan
 from core.wire.market import (
     Permit,
     PermitRequest,
@@ -35,6 +36,8 @@ from core.wire.plant import (
     TapRequest,
 )
 from plant_service.journal import Journal
+from plant_service.ledger import Ledger, When
+from plant_service.ledger import as_csv as as_lines
 from plant_service.pot import Pot
 from plant_service.station import Station
 
@@ -53,6 +56,7 @@ def add_pot(app: FastAPI, pot: Pot) -> None:
     """All routes of a pot."""
     _state_routes(app, pot)
     _inventory_routes(app, pot)
+    _ledger_routes(app, pot.tending.ledger)
     _task_routes(app, pot)
     _robot_routes(app, pot)
     _dock_routes(app, pot)
@@ -94,16 +98,16 @@ def _inventory_routes(app: FastAPI, pot: Pot) -> None:
     async def inventory(
         colour: Colour | None = None, if_none_match: Annotated[str, Header(max_length=200)] = ""
     ) -> Response:
-        return pot.shelf.answer(colour, if_none_match)
+        return pot.tending.shelf.answer(colour, if_none_match)
 
     @app.post("/inventory/fruits", tags=["inventory"], summary="Add one fruit", status_code=201, response_model=Fruit)
     async def add(caller: Caller = allow("robot", "operator"), fruit: NewFruit = body(NewFruit)) -> Response:
-        return await pot.shelf.add(fruit)
+        return await pot.tending.shelf.add(fruit)
 
     @app.post("/inventory/scans", tags=["inventory"], summary="Merge what a scan saw", response_model=Inventory)
     async def scan(caller: Caller = allow("robot", "operator"), seen: Scan = body(Scan)) -> Response:
         speaks_for(caller, seen.robot_id or caller.subject)
-        return await pot.shelf.merge(seen)
+        return await pot.tending.scan(seen, caller.subject if caller.role == "robot" else "")
 
     @app.delete("/inventory/fruits/{fruit_id}", tags=["inventory"], summary="A fruit is gone", status_code=204)
     async def remove(
@@ -111,17 +115,51 @@ def _inventory_routes(app: FastAPI, pot: Pot) -> None:
         if_match: Annotated[str, Header(max_length=200)] = "",
         caller: Caller = allow("robot", "operator"),
     ) -> Response:
-        now = await pot.shelf.remove(fruit_id, if_match)
+        now = await pot.tending.shelf.remove(fruit_id, if_match)
         return Response(status_code=204, headers={"etag": now})
 
     async def whole(scope: Scope, receive: Receive, send: Send) -> None:
         known = header(scope["headers"], b"if-none-match")[:200]
-        await pot.shelf.answer(None, known)(scope, receive, send)
+        await pot.tending.shelf.answer(None, known)(scope, receive, send)
 
     serve_direct(app, "GET", "/inventory", whole)
     serve_direct(app, "POST", "/inventory/fruits")
     serve_direct(app, "POST", "/inventory/scans")
-    serve_ready(app, "/inventory", pot.shelf.whole)
+    serve_ready(app, "/inventory", pot.tending.shelf.whole)
+
+    @app.get("/forecast", tags=["inventory"], summary="Ripe fruit some time ahead, with an interval")
+    async def forecast(
+        ahead_s: Annotated[float, Query(ge=0, le=30 * DAY_S, allow_inf_nan=False, description="a day if not given")] = DAY_S,
+    ) -> Forecast:
+        return pot.tending.forecast(ahead_s)
+
+
+def _ledger_routes(app: FastAPI, book: Ledger) -> None:
+    @app.get(
+        "/ledger",
+        tags=["ledger"],
+        summary="Every pick: who asked, who bid, who picked, how it ended",
+        response_model=list[LedgerLine],
+        responses={200: {"content": {"text/csv": {}}}},
+    )
+    async def lines(format: Literal["json", "csv"] = "json") -> Response | list[LedgerLine]:
+        known = book.lines()
+        return PlainTextResponse(as_lines(known), media_type="text/csv") if format == "csv" else known
+
+    @app.get(
+        "/ledger/{line_id}/{when}.jpg",
+        tags=["ledger"],
+        summary="The picture before or after a pick",
+        response_class=Response,
+        responses={200: {"content": {"image/jpeg": {}}}},
+    )
+    async def picture(line_id: Id, when: When) -> Response:
+        return await book.picture(line_id, when)
+
+    @app.put("/ledger/{line_id}/{when}.jpg", tags=["ledger"], summary="Keep a picture of a pick", status_code=204)
+    async def keep(line_id: Id, when: When, caller: Caller = allow("robot"), jpeg: bytes = raw("image/jpeg")) -> Response:
+        await book.keep(line_id, when, jpeg, caller.subject)
+        return Response(status_code=204)
 
 
 def _task_routes(app: FastAPI, pot: Pot) -> None:
@@ -129,7 +167,7 @@ def _task_routes(app: FastAPI, pot: Pot) -> None:
     async def tasks() -> list[Task]:
         return pot.place.market.tasks()
 
-    @app.post("/tasks", tags=["tasks"], summary="Ask for water", status_code=201)
+    @app.post("/tasks", tags=["tasks"], summary="Ask for water, a scan or ripe fruit", status_code=201)
     async def ask(response: Response, caller: Caller = allow("operator"), request: TaskRequest = body(TaskRequest)) -> Task:
         task = await pot.ask(request, caller.subject)
         response.headers["location"] = f"/tasks/{task.task_id}"
@@ -148,7 +186,7 @@ def _robot_routes(app: FastAPI, pot: Pot) -> None:
     @app.post("/tasks/{task_id}/reports", tags=["tasks"], summary="A robot's progress; renews its lease")
     async def report(task_id: Id, caller: Caller = allow("robot"), told: Report = body(Report)) -> ReportAnswer:
         speaks_for(caller, told.robot_id)
-        return await pot.place.change(lambda m, now_s: m.report(task_id, told, now_s))
+        return await pot.tending.report(task_id, told)
 
     @app.post("/tasks/{task_id}/permits", tags=["tasks"], summary="A one-shot permit for the irreversible act")
     async def permit(
@@ -158,7 +196,7 @@ def _robot_routes(app: FastAPI, pot: Pot) -> None:
         idempotency_key: IdempotencyKey = "",
     ) -> Permit:
         speaks_for(caller, request.robot_id)
-        return await pot.place.change(lambda m, now_s: m.permit(task_id, request, idempotency_key, now_s))
+        return await pot.tending.permit(task_id, request, idempotency_key)
 
 
 def _dock_routes(app: FastAPI, pot: Pot) -> None:

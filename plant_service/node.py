@@ -23,11 +23,13 @@ from plant_service import api
 from plant_service.inventory import Fruits, InventoryDocument
 from plant_service.journal import Journal
 from plant_service.keeper import Keeper
+from plant_service.ledger import Ledger, LedgerDocument, Lines
 from plant_service.market import Marketplace
 from plant_service.pot import Care, Pot
 from plant_service.settings import PlantSettings
 from plant_service.shelf import Shelf
 from plant_service.station import Meter, Station, TapDocument
+from plant_service.tending import Tending
 from plant_service.texts import FruitTexts
 
 if TYPE_CHECKING:
@@ -92,16 +94,25 @@ def build_pot(parts: _Parts) -> Node:
     settings, clock, journal = parts.settings, parts.clock, parts.journal
     limits = Limits()
     card, base = settings.card(), settings.care()
-    market = Keeper(parts.file("market"), MarketDocument, lambda doc: Market(card, doc, clock.now(), limits=limits))
     texts = FruitTexts()
     stored = parts.file("inventory", GATHER_S)
     fruits = Keeper(stored, InventoryDocument, lambda doc: Fruits(settings.id, doc), texts.stored)
+
+    def revived(doc: MarketDocument | None) -> Market:
+        market = Market(card, doc, clock.now(), limits=limits)
+        market.fruits(fruits.machine.inventory.fruits, clock.now())
+        return market
+
+    market = Keeper(parts.file("market"), MarketDocument, revived)
+    lines = Keeper(parts.file("ledger"), LedgerDocument, Lines)
     care = Keeper(parts.file("settings"), SettingsPatch, lambda doc: Care(base, doc))
     docks = parts.docks([settings.id])
     probe = open_probe(settings.probe_url, parts.opener, clock)
     place = Marketplace(market, parts.mesh, parts.peers, clock, journal)
-    pot = Pot(settings, clock, probe, place, docks, Shelf(fruits, clock, texts), care, journal)
-    keepers = (market, fruits, care, docks)
+    book = Ledger(lines, settings.folder / "pictures", clock, parts.disk)
+    tending = Tending(fruits, Shelf(fruits, clock, texts), book, place, clock, journal)
+    pot = Pot(settings, clock, probe, place, docks, tending, care, journal)
+    keepers = (market, fruits, lines, care, docks)
     _tell_alarms(keepers, journal)
     app = create_app(
         card=pot.card, clock=clock, verifier=parts.verifier, ready=pot.ready, events=journal.events,

@@ -20,7 +20,7 @@ from plant_service.journal import Journal
 from plant_service.keeper import Keeper
 from plant_service.market import Marketplace
 from plant_service.settings import PlantSettings
-from plant_service.shelf import Shelf
+from plant_service.tending import Tending
 
 SAMPLES = 5
 SAMPLE_WITHIN_S = 5.0
@@ -78,11 +78,11 @@ class Pot:
         probe: SoilProbe,
         place: Marketplace,
         docks: Keeper[Docks, DocksDocument],
-        shelf: Shelf,
+        tending: Tending,
         care: Keeper[Care, SettingsPatch],
         journal: Journal,
     ) -> None:
-        self.settings, self.place, self.docks, self.shelf, self.care = settings, place, docks, shelf, care
+        self.settings, self.place, self.docks, self.tending, self.care = settings, place, docks, tending, care
         self.journal = journal
         self._clock, self._probe = clock, probe
         self._limits = soil_limits(settings)
@@ -98,11 +98,13 @@ class Pot:
     def card(self) -> NodeCard:
         card = self.settings.card()
         place = {"stem": card.stem.model_dump(), "dock": card.dock.model_dump(), "nozzle": card.nozzle.model_dump()}
-        return NodeCard(id=self.settings.id, kind="plant", capabilities=["water", "inventory"], place=place, links=_links())
+        return NodeCard(
+            id=self.settings.id, kind="plant", capabilities=["water", "inventory", "harvest"], place=place, links=_links()
+        )
 
     def ready(self) -> list[str]:
         """What is missing before the pot does its work; empty: ready."""
-        stores = {"market": self.place.broken, "docks": self.docks.broken, "inventory": self.shelf.broken}
+        stores = {"market": self.place.broken, "docks": self.docks.broken, "inventory": self.tending.shelf.broken}
         missing = [f"{name} cannot be stored: {why}" for name, why in stores.items() if why]
         return missing if self._state is not None else [*missing, "the soil has not been measured yet"]
 
@@ -112,7 +114,8 @@ class Pot:
             plant_id=self.settings.id, now_s=now_s, soil=self.soil(), thirsty=self._thirsty,
             settings=self.care.machine.settings, open_tasks=[task.task_id for task in market.open_tasks()],
             watered_today_ml=market.given_ml(now_s), dock_holder=self.docks.machine.loan("", now_s).robot_id,
-            waiting=self.waiting(), card=self.settings.card(),
+            fruit=self.tending.counts(), fruit_uncertainty=self.tending.uncertainty(), waiting=self.waiting(),
+            card=self.settings.card(),
         )  # fmt: skip
 
     def soil(self) -> SoilReading:
@@ -134,7 +137,7 @@ class Pot:
             return f"not watering: the soil probe is {self._why(self._state)}"[:500]
         if why := market.waiting(now_s):
             return why
-        if not self._thirsty or market.open_tasks():
+        if not self._thirsty or market.open_of("water"):
             return ""
         if market.left_ml(now_s) < permits.DOSE_ML_MIN:
             return f"thirsty, but the day's {market.limits.day_cap_ml:.0f} ml are given"
@@ -153,9 +156,9 @@ class Pot:
     # What others ask for
 
     async def ask(self, request: TaskRequest, by: str) -> Task:
-        """An operator wants water here; raises Conflict, Refused, or Unprocessable for what does not fit together."""
+        """An operator wants something here; raises Conflict or Refused."""
         if request.kind != "water":
-            raise Unprocessable(f"cannot ask for {request.kind} yet", hint="ask for water")
+            return await self.tending.ask(request, by)
         dose = request.dose_ml if request.dose_ml is not None else self.care.machine.settings.dose_ml
         return await self.place.change(lambda m, now_s: m.ask("water", dose, by, "asked by hand", now_s, request.priority))
 
@@ -163,7 +166,7 @@ class Pot:
         settings = await self.care.change(lambda care: care.change(patch))
         self._apply(settings)
         changed = patch.model_dump(exclude_none=True)
-        self.journal.note("settings", f"{by} set {', '.join(f'{k} = {v:g}' for k, v in changed.items())}")
+        self.journal.note("settings", f"{by} set {', '.join(f'{k} = {v}' for k, v in changed.items())}")
         return settings
 
     async def reserve(self, request: ReservationRequest) -> Reservation:
@@ -184,8 +187,9 @@ class Pot:
             await self.measure()
             try:
                 await self.think()
+                await self.tending.think(self.care.machine.settings)
             except StorageError as error:
-                self.journal.alarm(f"not asking for water: {error}")
+                self.journal.alarm(f"not asking for anything: {error}")
             every_s = self.care.machine.settings.probe_every_s
             if self.place.market.soaking:
                 every_s = min(every_s, SOAK_PROBE_S)
@@ -239,7 +243,7 @@ class Pot:
 
     def _should_ask(self) -> bool:
         market, now_s = self.place.market, self._clock.now()
-        able = self._state is ProbeState.GOOD and not market.permit_open and not market.open_tasks()
+        able = self._state is ProbeState.GOOD and not market.permit_open and not market.open_of("water")
         enough = market.left_ml(now_s) >= permits.DOSE_ML_MIN
         return self._thirsty and able and enough and now_s >= self._ask_again_s()
 
@@ -275,4 +279,7 @@ def soil_limits(settings: PlantSettings) -> Limits:
 
 
 def _links() -> dict[str, str]:
-    return {name: f"/{name}" for name in ("state", "inventory", "tasks", "history", "dock", "events", "docs")}
+    return {
+        name: f"/{name}"
+        for name in ("state", "inventory", "forecast", "ledger", "tasks", "history", "dock", "events", "docs")
+    }

@@ -56,6 +56,8 @@ class PlantSettings(BaseSettings):
     soak_s: Annotated[float, Field(ge=0, le=3600)] = 60.0
     inventory_every_s: Annotated[float, Field(ge=60, le=1e7)] = 43200.0
     uncertainty_max: Annotated[float, Field(gt=0, le=1)] = 0.4
+    inventory: bool = True
+    """Ask for scans; without it only when an operator does, or a pick is in doubt."""
     harvest: bool = True
     """Ask for fruit that was seen ripe to be picked; without it only when somebody orders."""
     place: Point3 = Point3(x_m=0.0, y_m=0.0, z_m=0.0)

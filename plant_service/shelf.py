@@ -5,7 +5,7 @@ from __future__ import annotations
 from starlette.responses import Response
 
 from core.clock import Clock
-from core.wire.fruit import Inventory, NewFruit, Scan
+from core.wire.fruit import Inventory, NewFruit
 from plant_service.inventory import Fruits, InventoryDocument, etag
 from plant_service.keeper import Keeper
 from plant_service.texts import FruitTexts
@@ -50,9 +50,9 @@ class Shelf:
         headers = {"location": f"/inventory/fruits/{added.fruit_id}", "etag": now}
         return Response(added.model_dump_json(exclude_none=True), 201, headers, media_type=JSON)
 
-    async def merge(self, scan: Scan) -> Response:
-        """The inventory with what the scan saw."""
-        return self._answer(await self._keeper.change(lambda fruits: fruits.merge(scan, self._clock.now())))
+    def now(self) -> Response:
+        """The inventory as the machine has it: for who has just waited for it to be durable."""
+        return self._answer(self._keeper.machine.inventory)
 
     async def remove(self, fruit_id: str, if_match: str) -> str:
         """The ETag afterwards; raises PreconditionFailed or NotFound."""

@@ -21,9 +21,6 @@ from core.errors import Conflict, Refused
 from core.wire.fruit import Fruit, Pick
 from core.wire.market import FINAL_STATES, Permit, PermitRequest, PlantCard, Report, ReportAnswer, Task, TaskKind
 
-PLANTS_OWN = ("soil", "fruit")
-"""Who asks when the plant asks for itself."""
-
 
 class Market(TaskBook):
     """One plant's tasks, their holders and the permits. See the module's text for the order of calls."""
@@ -158,13 +155,18 @@ class Market(TaskBook):
 
     def scanned(self, task_id: str, robot_id: str, scan_id: str, now_s: float) -> None:
         """A scan came for this task, whatever its kind; raises Refused unless its holder sent it."""
+        task = self.check_scan(task_id, robot_id)
+        if task.kind == "inventory" and task_id not in self._scanned:
+            self._scanned[task_id] = scan_id
+            self._event(task, f"{robot_id} has scanned", now_s)
+
+    def check_scan(self, task_id: str, robot_id: str) -> Task:
+        """The task a scan is for; raises Refused unless the robot holds it: what it saw may be long past."""
         task = self.task(task_id)
         if task.robot_id != robot_id or not self._is_live(task_id):
             holder = f"held by {task.robot_id or 'nobody'}, {task.state}"
             raise Refused(f"{task_id} is {holder}: its scan is too late", hint="the plant asks for another if need be")
-        if task.kind == "inventory" and task_id not in self._scanned:
-            self._scanned[task_id] = scan_id
-            self._event(task, f"{robot_id} has scanned", now_s)
+        return task
 
     def settle(self, decided: Mapping[str, bool], now_s: float) -> None:
         """A scan decided about fruit in doubt: whether each still hangs there."""

@@ -32,10 +32,9 @@ class Eye(Document):
     seen: Count = 0
 
 
-class Track(Document):
-    """One fruit with its evidence; durable with the inventory."""
+class Evidence(Document):
+    """What the plant's document says of a fruit rests on this; durable with it."""
 
-    fruit: Fruit
     seen: list[Observation]
     """What scans said of its colour and size, oldest first."""
     eyes: list[Eye] = []
@@ -47,9 +46,17 @@ class Track(Document):
     blind_scans: Count = 0
     """Scans since its pick came into doubt that could not have seen it."""
 
+
+class Track(Evidence):
+    """One fruit with its evidence."""
+
+    fruit: Fruit
+
     @classmethod
-    def of(cls, fruit: Fruit) -> Track:
-        """Of a fruit that nobody has given evidence for."""
+    def of(cls, fruit: Fruit, evidence: Evidence | None = None) -> Track:
+        """Without `evidence`: a fruit that somebody only told of."""
+        if evidence is not None:
+            return cls.model_construct(fruit=fruit, **{name: getattr(evidence, name) for name in Evidence.model_fields})
         first = Observation(t_s=fruit.last_seen_s, colour=fruit.colour, radius_m=fruit.radius_m, ripeness=fruit.ripeness)
         since_s = fruit.last_seen_s if fruit.colour == "red" else None
         return cls(fruit=fruit, seen=[first], ripe_since_s=since_s)
@@ -57,6 +64,10 @@ class Track(Document):
     @property
     def p(self) -> tuple[float, float, float]:
         return self.fruit.x_m, self.fruit.y_m, self.fruit.z_m
+
+    @property
+    def evidence(self) -> Evidence:
+        return Evidence.model_construct(**{name: getattr(self, name) for name in Evidence.model_fields})
 
     def belief(self, pace: Pace) -> Belief:
         return believe(self.seen, pace)

@@ -23,12 +23,12 @@ from core.mesh.direct import route_of, run_directly
 from core.mesh.events import EventLog
 from core.mesh.guard import Guard, bearer, request_counter
 from core.mesh.problems import problem_response
-from core.mesh.strict import body, no_surplus, parse, plain_read
+from core.mesh.strict import body, no_surplus, parse, plain_read, raw
 from core.wire.documents import Document, HistoryEntry, NodeCard
 
 SSE_SILENCE_S = 15.0
 
-__all__ = ["Allow", "allow", "body", "create_app", "parse", "serve_direct", "serve_ready", "version"]
+__all__ = ["Allow", "allow", "body", "create_app", "parse", "raw", "serve_direct", "serve_ready", "version"]
 
 
 class Health(Document):

@@ -11,7 +11,7 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.routing import iter_route_contexts
 from pydantic.json_schema import models_json_schema
 
-from core.mesh.strict import readers
+from core.mesh.strict import raw_reader, readers
 from core.wire.documents import Problem
 
 _REF = "#/components/schemas/{model}"
@@ -73,6 +73,9 @@ def _complete(operation: dict[str, Any], route: Any) -> list[Any]:
     for reader in readers(route.dependant):
         used.append((reader.model, "validation"))
         content = {"application/json": {"schema": {"$ref": _REF.format(model=reader.model.__name__)}}}
+        operation["requestBody"] = {"required": True, "content": content}
+    if (taken := raw_reader(route.dependant)) is not None:
+        content = {taken.media_type: {"schema": {"type": "string", "format": "binary"}}}
         operation["requestBody"] = {"required": True, "content": content}
     if (roles := roles_of(route)) is not None:
         operation["security"] = [{"token": []}]

@@ -30,6 +30,23 @@ class Reader:
         return parse(self.model, await request.body())
 
 
+def raw(media_type: str) -> Any:
+    """`jpeg: bytes = raw("image/jpeg")` in an endpoint: the body as it is, of this type."""
+    return Depends(RawReader(media_type))
+
+
+class RawReader:
+    """The dependency behind `raw`."""
+
+    def __init__(self, media_type: str) -> None:
+        self.media_type = media_type
+
+    async def __call__(self, request: Request) -> bytes:
+        if request.headers.get("content-type", "").partition(";")[0].strip().lower() != self.media_type:
+            raise BadRequest(f"this takes {self.media_type}", hint=f"send Content-Type: {self.media_type}")
+        return await request.body()
+
+
 def parse(model: type[M], raw: bytes) -> M:
     """One document from bytes; raises BadRequest for what is not JSON, Unprocessable for what is not this document."""
     _check_json(raw)
@@ -115,7 +132,8 @@ async def no_surplus(request: Request) -> None:
     if strange := next((name for name in request.query_params if name not in known), None):
         hint = f"known here: {', '.join(sorted(known))}" if known else "this takes no query parameter"
         raise Unprocessable(f"no query parameter {strange[:40]!r}", hint=hint)
-    if request.method not in _READS and not readers(dependant) and (await request.body()).strip() not in (b"", b"{}"):
+    takes_any = readers(dependant) or raw_reader(dependant)
+    if request.method not in _READS and not takes_any and (await request.body()).strip() not in (b"", b"{}"):
         raise BadRequest("this takes no body", hint="send none, or {}")
 
 
@@ -131,3 +149,10 @@ def readers(dependant: Any) -> list[Reader]:
     for inner in dependant.dependencies:
         found += readers(inner)
     return found
+
+
+def raw_reader(dependant: Any) -> RawReader | None:
+    """The `raw(...)` of a route, also of its dependencies."""
+    if isinstance(dependant.call, RawReader):
+        return dependant.call
+    return next((found for inner in dependant.dependencies if (found := raw_reader(inner))), None)

@@ -36,6 +36,8 @@ class Settings(Document):
     """A scan is asked for at the latest after this long, and sooner when what is known has grown too uncertain."""
     uncertainty_max: Annotated[float, Field(gt=0, le=1)] = 0.4
     """Of the inventory: above it the pot asks for a scan."""
+    inventory: bool = True
+    """Ask for scans; without it only when an operator does, or a pick is in doubt."""
     harvest: bool = True
     """Ask for fruit that was seen ripe to be picked; without it only when somebody orders."""
 
@@ -51,6 +53,7 @@ class SettingsPatch(Document):
     soak_s: Annotated[float, Field(ge=0, le=3600)] | None = None
     inventory_every_s: Annotated[float, Field(ge=60, le=1e7)] | None = None
     uncertainty_max: Annotated[float, Field(gt=0, le=1)] | None = None
+    inventory: bool | None = None
     harvest: bool | None = None
 
 

@@ -30,6 +30,7 @@ from core.scenario import Scenario, find
 from core.virtual import run_virtual
 from lab.garden import Garden
 from lab.quiet import hush
+from lab.story import WATER_ONLY
 from sim.scene.build import DT_S
 from sim.world import World
 
@@ -81,7 +82,9 @@ def bench_busy(n: int = 1, seconds: float = BUSY_S) -> Row:
     """The whole garden on the virtual clock, every pot thirsty, both robots at work, cameras off."""
 
     async def main(folder: Path) -> float:
-        async with Garden(_with_moisture(find("garden"), THIRSTY_RATIO), folder) as garden:
+        scenario = _with_moisture(find("garden"), THIRSTY_RATIO)
+        pots = {plant.id: WATER_ONLY for plant in scenario.plants}
+        async with Garden(scenario, folder, settings=pots) as garden:
             await garden.clock.sleep(BUSY_AFTER_S)
             return await _spent_s(garden, seconds)
 
@@ -96,7 +99,7 @@ def bench_quiet_day(seconds: float = DAY_S) -> Row:
     scenario = scenario.model_copy(update={"climate": scenario.climate.model_copy(update={"litres_per_day": 0.0})})
 
     async def main(folder: Path) -> float:
-        async with Garden(scenario, folder) as garden:
+        async with Garden(scenario, folder, settings={plant.id: WATER_ONLY for plant in scenario.plants}) as garden:
             return await _spent_s(garden, seconds)
 
     day_s = _virtual(main)

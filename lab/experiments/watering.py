@@ -25,6 +25,7 @@ from core.wire.market import FINAL_STATES
 from lab.garden import Garden
 from lab.quiet import hush
 from lab.results import Result, held
+from lab.story import WATER_ONLY
 from sim.truth import Collisions
 
 TRIALS = 10
@@ -79,7 +80,9 @@ def trial(seed: int, plant_id: str) -> Trial:
 
 
 async def _trial(seed: int, plant_id: str, folder: Path) -> Trial:
-    async with Garden(one_dry_pot(plant_id), folder, seed=seed) as garden:
+    scenario = one_dry_pot(plant_id)
+    pots = {plant.id: WATER_ONLY for plant in scenario.plants}
+    async with Garden(scenario, folder, seed=seed, settings=pots) as garden:
         before = garden.truth().plant(plant_id)
         times: dict[str, float] = {}
         task: dict[str, Any] = {}

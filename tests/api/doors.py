@@ -64,7 +64,8 @@ class Operation:
     def url(self, **ids: str) -> str:
         """The path with every id filled in, by names that nobody has."""
         filled = self.path.replace("{robot}", "robot-1").replace("{plant_id}", ids.get("plant_id", "plant-1"))
-        for name in ("task_id", "fruit_id", "job_id", "fault_id", "reservation_id"):
+        filled = filled.replace("{when}", "before")
+        for name in ("task_id", "fruit_id", "line_id", "job_id", "fault_id", "reservation_id"):
             filled = filled.replace(f"{{{name}}}", ids.get(name, "nobody:1:1"))
         return filled + ("?w=32&h=24" if filled.endswith("hand.jpg") else "")
 
@@ -168,7 +169,8 @@ def open_doors(folder: Path) -> Iterator[Doors]:
     """A garden of two moist pots, a robot that stands near them and a station; all of it localised and at rest."""
     scenario = story.garden_of((), ("plant-1", "plant-2"), (story.near_robot(),))
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        garden = runner.run(Garden(scenario, folder).__aenter__())
+        pots = {plant.id: story.WATER_ONLY for plant in scenario.plants}
+        garden = runner.run(Garden(scenario, folder, settings=pots).__aenter__())
         try:
             runner.run(garden.clock.sleep(6.0))
             apps = {kind: _app(garden, name) for kind, name in KINDS.items() if kind != "console"}

@@ -51,7 +51,7 @@ RESERVE = {"robot_id": "robot-1", "dock_id": "", "for_s": 3.0, "yielding": True}
 GOOD: dict[tuple[str, str, str], dict[str, Any]] = {
     ("plant", "PATCH", "/settings"): {
         "threshold_ratio": 0.2, "target_ratio": 0.24, "dose_ml": 100.0, "day_cap_ml": 900.0, "probe_every_s": 9.0,
-        "soak_s": 5.0, "inventory_every_s": 9000.0, "uncertainty_max": 1.0, "harvest": False,
+        "soak_s": 5.0, "inventory_every_s": 9000.0, "uncertainty_max": 1.0, "inventory": False, "harvest": False,
     },
     ("plant", "POST", "/inventory/fruits"): FRUIT,
     ("plant", "POST", "/inventory/scans"): SCAN,
@@ -293,7 +293,7 @@ RULES = [
         "robot",
         "POST",
         "/tasks",
-        {"announcement": ANNOUNCED | {"kind": "harvest"}, "epoch": 1, "lease_s": 8.0, "cost_s": 2.0},
+        {"announcement": ANNOUNCED | {"kind": "probe"}, "epoch": 1, "lease_s": 8.0, "cost_s": 2.0},
     ),
     ("robot", "POST", "/jobs", {"kind": "goto"}),
     ("robot", "POST", "/jobs", {"kind": "goto", "x_m": 1.0}),

@@ -21,8 +21,10 @@ MAY: dict[tuple[str, str, str], set[str] | str] = {
     **{(kind, "GET", "/events"): ANYBODY for kind in ("plant", "station", "robot", "sim")},
     **{
         ("plant", "GET", path): ANYBODY
-        for path in ("/state", "/inventory", "/tasks", "/tasks/{task_id}", "/dock", "/history")
+        for path in ("/state", "/inventory", "/forecast", "/tasks", "/tasks/{task_id}", "/dock", "/history")
     },
+    **{("plant", "GET", path): ANYBODY for path in ("/ledger", "/ledger/{line_id}/{when}.jpg")},
+    ("plant", "PUT", "/ledger/{line_id}/{when}.jpg"): ROBOT,
     ("plant", "PATCH", "/settings"): OPERATOR,
     ("plant", "POST", "/inventory/fruits"): KEEPERS,
     ("plant", "POST", "/inventory/scans"): KEEPERS,

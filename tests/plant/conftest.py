@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import random
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
@@ -30,6 +31,9 @@ from sim.devices.firmata import FirmataEmulator
 from sim.devices.host import EmulatorHost
 
 SOIL_ML = 3000.0
+EYES = [(0.45, y, z) for z in (0.12, 0.32) for y in (-0.15, 0.0, 0.15)]
+"""From where a scripted robot looks at a plant."""
+JPEG = b"\xff\xd8\xff\xe0 a picture \xff\xd9"
 KEY = GardenKey.from_seed(1)
 
 
@@ -162,6 +166,70 @@ class Robot:
         await report("done", delivered_ml=permit["dose_ml"])
 
 
+class Picker(Robot):
+    """A scripted robot with an eye and a hand. `tree` is what really hangs there: place -> colour."""
+
+    def __init__(self, garden: Garden, robot_id: str, tree: dict[tuple[float, float, float], str]) -> None:
+        super().__init__(garden, robot_id)
+        self.tree, self.basket, self.out_of_reach = tree, [], set[str]()
+        self.die_holding, self.scans = False, 0
+
+    async def work(self, award: Award) -> None:
+        asked = award.announcement
+        await {"inventory": self.scan, "harvest": self.pick}.get(asked.kind, super().work)(award)
+
+    async def tell(self, award: Award, state: str, **more: Any) -> dict[str, Any]:
+        body = {"robot_id": self.id, "epoch": award.epoch, "state": state, **more}
+        asked = award.announcement
+        return await self.garden.robot_post(self, asked.plant.plant_id, f"/tasks/{asked.task_id}/reports", body)
+
+    def views(self) -> list[dict[str, Any]]:
+        look, up = {"x": -1.0, "y": 0.0, "z": 0.0}, {"x": 0.0, "y": 0.0, "z": 1.0}
+        places = [dict(zip(("x_m", "y_m", "z_m"), eye, strict=True)) for eye in EYES]
+        return [place | {"look": look, "up": up, "fov_x_rad": 1.6, "fov_y_rad": 1.4} for place in places]
+
+    def seen(self) -> list[dict[str, Any]]:
+        places = [dict(zip(("x_m", "y_m", "z_m"), place, strict=True)) for place in self.tree]
+        more = {"radius_m": 0.013, "confidence": 0.9, "sigma_m": 0.004, "views": list(range(6))}
+        return [place | more | {"colour": colour} for place, colour in zip(places, self.tree.values(), strict=True)]
+
+    async def scan(self, award: Award) -> None:
+        await self.tell(award, "running", phase="scan")
+        await self.garden.clock.sleep(5.0)
+        asked, self.scans = award.announcement, self.scans + 1
+        scan = {"scan_id": f"{asked.task_id}:{award.epoch}", "task_id": asked.task_id, "robot_id": self.id,
+                "views": self.views(), "sightings": self.seen()}  # fmt: skip
+        await self.garden.robot_post(self, asked.plant.plant_id, "/inventory/scans", scan)
+        await self.tell(award, "done")
+
+    async def pick(self, award: Award) -> None:
+        asked, picks = award.announcement, list[dict[str, Any]]()
+        for fruit in asked.fruits[: asked.count]:
+            await self.tell(award, "running", phase="pick", picks=picks)
+            if fruit.fruit_id in self.out_of_reach:
+                picks.append({"fruit_id": fruit.fruit_id, "outcome": "unreachable", "reason": "too high"})
+                continue
+            wish = {"robot_id": self.id, "epoch": award.epoch, "act": "pick", "fruit_id": fruit.fruit_id}
+            path, plant = f"/tasks/{asked.task_id}/permits", asked.plant.plant_id
+            permit = await self.garden.robot_post(self, plant, path, wish, key=f"{award.epoch}/{fruit.fruit_id}")
+            if "permit_id" not in permit:
+                continue
+            await self.garden.clock.sleep(2.0)
+            place = min(self.tree, key=lambda at: math.dist(at, (fruit.x_m, fruit.y_m, fruit.z_m)))
+            assert math.dist(place, (fruit.x_m, fruit.y_m, fruit.z_m)) < 0.03, f"{fruit.fruit_id} is a phantom"
+            del self.tree[place]
+            self.basket.append(fruit.fruit_id)
+            if self.die_holding:
+                return self.die()
+            for when in ("before", "after"):
+                await self.garden.call(
+                    plant, "PUT", f"/ledger/{permit['permit_id']}/{when}.jpg", who=self.id, role="robot",
+                    content=JPEG, headers={"content-type": "image/jpeg"},
+                )  # fmt: skip
+            picks.append({"fruit_id": fruit.fruit_id, "outcome": "picked", "permit_id": permit["permit_id"]})
+        await self.tell(award, "done", picks=picks)
+
+
 class Garden:
     """Pots, soils and robots in one process. Killing a pot cancels its loops; `start_pot` again reads the same folder."""
 
@@ -183,6 +251,12 @@ class Garden:
     def robot(self, robot_id: str, cost_s: float | None = 10.0) -> Robot:
         self.robots[robot_id] = Robot(self, robot_id, cost_s)
         return self.robots[robot_id]
+
+    def picker(self, robot_id: str, tree: dict[tuple[float, float, float], str]) -> Picker:
+        """One that scans and picks what hangs on `tree`."""
+        picker = Picker(self, robot_id, tree)
+        self.robots[robot_id] = picker
+        return picker
 
     def soil(self, name: str, ratio: float) -> Soil:
         soil = self.soils[name] = Soil(random.Random(self.rng.random()), ratio)
@@ -212,7 +286,7 @@ class Garden:
         settings = PlantSettings(
             id=plant_id, url=f"http://{plant_id}", data=self.folder / plant_id,
             stem=Point3(x_m=0.0, y_m=0.0, z_m=0.25), dock=Pose2(x_m=0.55, y_m=0.0, yaw_rad=3.14),
-            probe_url=f"memory://{plant_id}?pin=0", **({"soak_s": 20.0} | more),
+            probe_url=f"memory://{plant_id}?pin=0", **({"soak_s": 20.0, "inventory": False, "harvest": False} | more),
         )  # fmt: skip
         return self._start(settings)
 
