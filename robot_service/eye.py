@@ -24,8 +24,8 @@ JPEG_COST_S = 0.01
 JPEG_QUALITY = 80
 SHOW_EVERY_S = 0.5
 """People are shown a new picture this often [garden s]."""
-FRESH_S = 3.0
-"""A camera that gives no new picture within this time is silent."""
+FRESH_S = 8.0
+"""A camera that gives no new picture within this time [s of the wall] is silent; the driver itself waits less."""
 
 
 class Frame(Protocol):
@@ -80,7 +80,7 @@ class Eye:
         if self._pictures is None:
             raise SkillFailed("this robot has no camera")
         try:
-            async with self._clock.timeout(FRESH_S):
+            async with asyncio.timeout(FRESH_S):
                 frame = await self._pictures.fresh(self._clock.now())
         except TimeoutError:
             raise SkillFailed(f"the camera gave no picture for {FRESH_S:g} s") from None
