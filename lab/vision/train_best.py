@@ -33,7 +33,8 @@ except ImportError as error:
 Array = NDArray[Any]
 Progress = Callable[[str], None]
 
-STEPS = 2200
+CYCLES = (2200, 4000)
+"""Steps while the rate falls to nothing, and again from where that ended (warm restarts: Loshchilov and Hutter 2017)."""
 BATCH = 8
 RATE = 2e-3
 WEIGHT_DECAY = 1e-4
@@ -89,13 +90,27 @@ def source(photograph: dataset.Photograph) -> str:
     return photograph.group.split("/")[0]
 
 
-def fitted(photographs: Sequence[dataset.Photograph], seed: int, progress: Progress, steps: int = STEPS) -> FruitNetwork:
-    """The network after `steps` batches."""
+def fitted(photographs: Sequence[dataset.Photograph], seed: int, progress: Progress) -> FruitNetwork:
+    """The network after all cycles."""
     torch.manual_seed(seed)
-    rng = np.random.default_rng(seed)
     scenes, weights = gathered(photographs)
-    network = FruitNetwork().to(memory_format=torch.channels_last)
+    network: FruitNetwork = FruitNetwork().to(memory_format=torch.channels_last)
+    for cycle, steps in enumerate(CYCLES):
+        network = cycled(network, scenes, weights, steps, np.random.default_rng([seed, cycle]), progress)
+    return network
+
+
+def cycled(
+    network: FruitNetwork,
+    scenes: Sequence[augment.Scene],
+    weights: Array,
+    steps: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> FruitNetwork:
+    """The running mean of the network's weights at the end of one cycle; the network itself is changed too."""
     average: FruitNetwork = copy.deepcopy(network)
+    network.train()
     optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps, pct_start=0.1)
     told: list[Array] = []
