@@ -18,14 +18,16 @@ from rich.live import Live
 
 from console import tables
 from console.folder import Folder
+from console.orders import order_of, place
 from console.snapshot import all_tasks, look
-from core.clock import WallClock
+from core.clock import Clock, WallClock
 from core.errors import BadRequest, GardenError, NotFound, PeerDown
 from core.mesh.client import Mesh
 from core.mesh.http import HttpTransport
 from core.mesh.peers import Peer, PeerKind, Peers
 from core.wire.documents import Document
 from core.wire.market import Task, TaskRequest
+from core.wire.order import Order, OrderRequest
 from core.wire.plant import PlantState
 from core.wire.robot import Job, JobKind, JobRequest, RobotState, Stopped, StopRequest
 
@@ -41,6 +43,7 @@ class Line:
 
     mesh: Mesh
     peers: Peers
+    clock: Clock
 
     def peer(self, name: str, kind: PeerKind) -> Peer:
         peer = self.peers.find(name)
@@ -54,9 +57,10 @@ class Line:
 async def open_line(data: Path, role: str = "") -> AsyncIterator[Line]:
     """With a `role`, requests carry that role's token."""
     folder = Folder(data)
-    mesh = Mesh(HttpTransport(), folder.identity(role) if role else None, WallClock(), timeout_s=3.0)
+    clock = WallClock()
+    mesh = Mesh(HttpTransport(), folder.identity(role) if role else None, clock, timeout_s=3.0)
     try:
-        yield Line(mesh, Peers(folder.peers()))
+        yield Line(mesh, Peers(folder.peers()), clock)
     finally:
         await mesh.aclose()
 
@@ -161,6 +165,42 @@ def water(plant: str, ml: float | None, data: Path, as_json: bool) -> None:
 
     task = _run(data, "operator", ask)
     _show(task, as_json, lambda: f"{task.task_id}: {plant} asks for {task.dose_ml:g} ml; `garden tasks {task.task_id}`")
+
+
+def harvest(count: int, plant: str, wait: bool, data: Path, as_json: bool) -> None:
+    """Order ripe fruit and tell how it goes; ends with status 1 unless all of it came."""
+    wish = _request(OrderRequest, count=count, plant_id=plant)
+
+    async def ask(line: Line) -> Order:
+        pots = [line.peer(plant, "plant")] if plant else line.peers.of_kind("plant")
+        order = await _order(line, wish, pots)
+        told = ""
+        while wait and order.state == "running":
+            if not as_json and (now := tables.progress(order)) != told:
+                told = now
+                print(told, flush=True)
+            await asyncio.sleep(POLL_S)
+            order = order_of(order.order_id, await all_tasks(line.mesh, line.peers), order) or order
+        return order
+
+    ended = _run(data, "operator", ask)
+    _show(ended, as_json, lambda: tables.order(ended))
+    if ended.state not in ("running", "done"):
+        sys.exit(1)
+
+
+async def _order(line: Line, wish: OrderRequest, pots: list[Peer]) -> Order:
+    now_s = line.clock.now()
+    order_id = f"o{int(1000 * now_s)}"
+
+    async def send(pot: Peer, request: TaskRequest) -> Task:
+        return await line.mesh.call(pot, "POST", "/tasks", request, expect=Task)
+
+    parts = await place(order_id, wish, pots, line.mesh, send)
+    return Order(
+        order_id=order_id, count=wish.count, plant_id=wish.plant_id, asked_by="operator", created_s=now_s, updated_s=now_s,
+        parts=parts, delivered=0,
+    )  # fmt: skip
 
 
 D = TypeVar("D", bound=Document)

@@ -127,7 +127,7 @@ def status(
 
 @app.command()
 def plants(data: Data = DATA, as_json: Json = False) -> None:
-    """Every pot: its soil, what it asks for, why nothing happens."""
+    """Every pot: its soil, its fruit, what it asks for, why nothing happens."""
     from console import ask
 
     ask.plants(data, as_json)
@@ -164,6 +164,20 @@ def water(
     from console import ask
 
     ask.water(plant, ml, data, as_json)
+
+
+@app.command()
+def harvest(
+    count: Annotated[int, typer.Argument(min=1, max=200, help="How many ripe fruit")],
+    plant: Annotated[str, typer.Option(help="Only from this pot")] = "",
+    wait: Annotated[bool, typer.Option(help="Tell how it goes until it has ended")] = True,
+    data: Data = DATA,
+    as_json: Json = False,
+) -> None:
+    """Order ripe fruit: split over the pots, each finds a robot to pick its part."""
+    from console import ask
+
+    ask.harvest(count, plant, wait, data, as_json)
 
 
 Robot = Annotated[str, typer.Argument(help="Which robot")]

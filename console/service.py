@@ -9,7 +9,9 @@ from typing import Annotated, TypeVar
 from fastapi import FastAPI, Header, Path, Query
 from starlette.responses import Response
 
-from console.snapshot import Snapshot, look
+from console.orders import order_of, place
+from console.snapshot import Snapshot, all_tasks, look
+from core.clock import Clock
 from core.errors import GardenError, NotFound, PeerDown
 from core.mesh.auth import Caller
 from core.mesh.chassis import allow, body, create_app, version
@@ -19,11 +21,13 @@ from core.mesh.peers import Peer, Peers
 from core.mesh.runtime import Runtime
 from core.wire.documents import Document, NodeCard
 from core.wire.market import Task, TaskRequest
+from core.wire.order import Order, OrderRequest
 from core.wire.robot import Stopped, StopRequest
 
 D = TypeVar("D", bound=Document)
 PICTURE_WITHIN_S = 20.0
 """The world's first picture takes seconds: it loads its kernels."""
+ORDERS_KEPT = 100
 FRESH_S = 0.5
 """A snapshot serves everybody who asks within this time."""
 PAGE = FilePath(__file__).with_name("page.html")
@@ -39,7 +43,7 @@ class Answers(Document):
 
 
 async def build(runtime: Runtime) -> Node:
-    """The console as a node; it is a client like any other and holds no state."""
+    """The console as a node; it is a client like any other: what it forgets, the pots know."""
     mesh, peers = runtime.mesh(), runtime.peers
     card = NodeCard(
         id="console",
@@ -58,6 +62,7 @@ async def build(runtime: Runtime) -> Node:
     )
     _add_reads(app, mesh, peers)
     _add_buttons(app, mesh, peers)
+    _add_orders(app, Counter(mesh, peers, runtime.clock))
     return Node("console", "console", app)
 
 
@@ -134,6 +139,75 @@ def _add_buttons(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
             raise NotFound(f"no plant {plant_id!r}", hint=f"known: {', '.join(pot.id for pot in pots) or 'none'}")
         content = request.model_dump_json().encode()
         return await _pass_on(mesh, pot, "/tasks", content, authorization, Task)
+
+
+class Counter:
+    """Where orders are taken. It remembers how many were wanted; all else is in the pots."""
+
+    def __init__(self, mesh: Mesh, peers: Peers, clock: Clock) -> None:
+        self._mesh, self._peers, self._clock = mesh, peers, clock
+        self._orders: dict[str, Order] = {}
+        self._taken = 0
+
+    async def take(self, wish: OrderRequest, by: str, token: str) -> Order:
+        """Raises NotFound for an unknown plant, Refused when nothing ripe is known."""
+        pots = self._peers.of_kind("plant")
+        asked = [pot for pot in pots if wish.plant_id in ("", pot.id)]
+        if not asked:
+            raise NotFound(f"no plant {wish.plant_id!r}", hint=f"known: {', '.join(pot.id for pot in pots) or 'none'}")
+        self._taken += 1
+        now_s = self._clock.now()
+        order_id = f"o{int(1000 * now_s)}-{self._taken}"
+
+        async def send(pot: Peer, request: TaskRequest) -> Task:
+            return await _pass_on(self._mesh, pot, "/tasks", request.model_dump_json().encode(), token, Task)
+
+        parts = await place(order_id, wish, asked, self._mesh, send)
+        order = Order(
+            order_id=order_id, count=wish.count, plant_id=wish.plant_id, asked_by=by, created_s=now_s, updated_s=now_s,
+            parts=parts,
+        )  # fmt: skip
+        self._orders[order_id] = order
+        for old in list(self._orders)[:-ORDERS_KEPT]:
+            del self._orders[old]
+        return await self.order(order_id)
+
+    async def order(self, order_id: str) -> Order:
+        """Raises NotFound."""
+        found = order_of(order_id, await all_tasks(self._mesh, self._peers), self._orders.get(order_id))
+        if found is None:
+            raise NotFound(f"no order {order_id!r}", hint="GET /orders lists them")
+        if order_id in self._orders:
+            self._orders[order_id] = found
+        return found
+
+    async def orders(self) -> list[Order]:
+        """Newest first."""
+        tasks = await all_tasks(self._mesh, self._peers)
+        names = {*self._orders, *(task.order_id for task in tasks if task.order_id)}
+        found = [order_of(name, tasks, self._orders.get(name)) for name in names]
+        return sorted((order for order in found if order is not None), key=lambda order: (-order.created_s, order.order_id))
+
+
+def _add_orders(app: FastAPI, counter: Counter) -> None:
+    @app.get("/orders", tags=["orders"], summary="All orders, newest first")
+    async def orders() -> list[Order]:
+        return await counter.orders()
+
+    @app.get("/orders/{order_id}", tags=["orders"], summary="How far an order is")
+    async def order(order_id: Name) -> Order:
+        return await counter.order(order_id)
+
+    @app.post("/orders", tags=["orders"], summary="Order ripe fruit", status_code=201)
+    async def take(
+        response: Response,
+        authorization: Token = "",
+        caller: Caller = allow("operator"),
+        request: OrderRequest = body(OrderRequest),
+    ) -> Order:
+        taken = await counter.take(request, caller.subject, authorization)
+        response.headers["location"] = f"/orders/{taken.order_id}"
+        return taken
 
 
 async def _pass_on(mesh: Mesh, peer: Peer, path: str, content: bytes, token: str, expect: type[D]) -> D:

@@ -10,6 +10,7 @@ from rich.text import Text
 
 from console.snapshot import Silent, Snapshot
 from core.wire.market import FINAL_STATES, Bid, BidRound, Task
+from core.wire.order import Order
 from core.wire.plant import PlantState, StationState
 from core.wire.robot import RobotState
 
@@ -35,14 +36,15 @@ def _table(title: str, *headings: str) -> Table:
 
 
 def plants(states: Sequence[PlantState]) -> Table:
-    table = _table("Pots", "pot", "soil", "asks", "today ml", "tasks", "dock", "waiting for")
+    table = _table("Pots", "pot", "soil", "green", "turning", "red", "asks", "today ml", "tasks", "dock", "waiting for")
     for state in states:
         soil = state.soil
         wet = f"{soil.ratio:.3f}" if soil.ratio is not None else f"{soil.state}: {soil.why}"
+        fruit = (str(state.fruit.green), str(state.fruit.turning), str(state.fruit.red))
         asks = "water" if state.thirsty else ""
         open_tasks = ", ".join(state.open_tasks)
         table.add_row(
-            state.plant_id, wet, asks, f"{state.watered_today_ml:.0f}", open_tasks, state.dock_holder, state.waiting
+            state.plant_id, wet, *fruit, asks, f"{state.watered_today_ml:.0f}", open_tasks, state.dock_holder, state.waiting
         )
     return table
 
@@ -88,7 +90,13 @@ def silent(listed: Sequence[Silent]) -> Table:
 def story(task: Task) -> RenderableType:
     """One task from its first announcement to its end: who bid what, who won, and why."""
     head = Text(f"{task.task_id}: {task.kind} for {task.plant_id}, {task.state}", style="bold")
-    lines = [f"asked by {task.asked_by or '?'} at {task.created_s:.1f} s: {task.why}", f"dose {task.dose_ml:g} ml"]
+    lines = [f"asked by {task.asked_by or '?'} at {task.created_s:.1f} s: {task.why}"]
+    if task.kind == "water":
+        lines.append(f"dose {task.dose_ml:g} ml")
+    if task.kind == "harvest":
+        order_id = f", order {task.order_id}" if task.order_id else ""
+        lines.append(f"{task.count} wanted of {', '.join(task.fruit_ids)}{order_id}")
+        lines += [f"{pick.fruit_id} {pick.outcome}" + (f": {pick.reason}" if pick.reason else "") for pick in task.picks]
     if task.delivered_ml is not None:
         lines.append(f"delivered {task.delivered_ml:.1f} ml")
     if task.reason:
@@ -99,6 +107,25 @@ def story(task: Task) -> RenderableType:
     for event in task.events:
         events.add_row(f"{event.t_s:.1f}", event.what, event.robot_id, str(event.epoch))
     return Group(*parts, events)
+
+
+def progress(order: Order) -> str:
+    """One line: what has come, and what is under way."""
+    busy = [part for part in order.parts if part.state not in FINAL_STATES]
+    doing = "; ".join(f"{p.plant_id}: {p.robot_id or 'asking robots'} {p.phase or p.state}" for p in busy)
+    return f"{order.delivered} of {order.count} picked; {doing}" if doing else f"{order.delivered} of {order.count} picked"
+
+
+def order(ended: Order) -> RenderableType:
+    """An order with its parts."""
+    table = _table(
+        f"Order {ended.order_id}: {ended.state}, {ended.delivered} of {ended.count} ripe fruit",
+        "pot", "wanted", "picked", "by", "state", "task", "why",
+    )  # fmt: skip
+    for part in ended.parts:
+        fruit = ", ".join(part.picked)
+        table.add_row(part.plant_id, str(part.count), fruit, part.robot_id, part.state, part.task_id, part.reason)
+    return Group(table, Text(ended.reason, style="yellow")) if ended.reason else table
 
 
 def auction(round_: BidRound) -> Table:

@@ -121,12 +121,14 @@ class Tending:
             return await self._place.change(
                 lambda m, now_s: m.ask("inventory", 0.0, by, "asked by hand", now_s, request.priority)
             )
-        names = request.fruit_ids or [fruit.fruit_id for fruit in self.ripe()]
+        await self._make_way(by)
+        promised = {name for t in self._place.market.open_tasks() if t.kind == "harvest" for name in t.fruit_ids}
+        names = request.fruit_ids or [fruit.fruit_id for fruit in self.ripe() if fruit.fruit_id not in promised]
         if not names:
-            raise Refused("no ripe fruit is known here", hint="GET /forecast tells when there will be; or ask for a scan")
+            why = "all ripe fruit are being picked already" if promised else "no ripe fruit is known here"
+            raise Refused(why, hint="GET /forecast tells when there will be more; or ask for a scan")
         count = min(request.count or len(names), len(names))
         why = f"order {request.order_id}" if request.order_id else "asked by hand"
-        await self._make_way(by)
         return await self._place.change(
             lambda m, now_s: m.ask(
                 "harvest", 0.0, by, f"{count} ripe fruit: {why}", now_s, request.priority,

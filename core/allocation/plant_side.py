@@ -109,9 +109,13 @@ class Market(TaskBook):
         count: int = 0,
         order_id: str = "",
     ) -> Task:
-        """A new task; raises Conflict while another of its kind is open, Refused when it could not be served safely."""
-        if (task := self.open_of(kind)) is not None:
-            raise Conflict(f"{task.task_id} already asks for {kind}", hint="look at it, or cancel it first")
+        """A new task; raises Conflict while another of its kind (or, of a harvest, for one of its fruit) is open.
+
+        Raises Refused when it could not be served safely.
+        """
+        for task in self.open_tasks():
+            if task.kind == kind and (kind != "harvest" or set(fruit_ids) & set(task.fruit_ids)):
+                raise Conflict(f"{task.task_id} already asks for {kind}", hint="look at it, or cancel it first")
         if len(self.open_tasks()) >= self.rules.open_max:
             raise Conflict(f"{self.card.plant_id} has {self.rules.open_max} open tasks", hint="wait, or cancel one")
         if kind == "water":
@@ -270,10 +274,13 @@ class Market(TaskBook):
     # What the task book asks
 
     def _blocked_until_s(self, task: Task) -> float:
-        """While a permit is open no robot need come: it could not act. A doubt is settled by a scan before anything."""
+        """While a permit is open no robot need come: it could not act. A doubt is settled by a scan before anything.
+
+        One harvest after the other: there is one dock, and two robots would be in each other's way.
+        """
         if task.kind == "water" and self._water.open is not None:
             return math.inf
-        if task.kind == "harvest" and (self._picks.doubts or self._picks.open is not None):
+        if task.kind == "harvest" and (self._picks.doubts or self._picks.open is not None or self._being_harvested()):
             return math.inf
         return self._picks.clear_s() if task.kind == "inventory" else -math.inf
 
@@ -414,6 +421,9 @@ class Market(TaskBook):
         why = told(task) if task.picks else "none of its fruit is left to pick"
         self._finish(task, "done" if picked(task) else "failed", f"{why}; {reason}" if reason else why, now_s)
         return True
+
+    def _being_harvested(self) -> bool:
+        return any(task.kind == "harvest" and self._is_live(task.task_id) for task in self.open_tasks())
 
     def _is_live(self, task_id: str) -> bool:
         task = self._tasks.get(task_id)

@@ -65,7 +65,7 @@ class Operation:
         """The path with every id filled in, by names that nobody has."""
         filled = self.path.replace("{robot}", "robot-1").replace("{plant_id}", ids.get("plant_id", "plant-1"))
         filled = filled.replace("{when}", "before")
-        for name in ("task_id", "fruit_id", "line_id", "job_id", "fault_id", "reservation_id"):
+        for name in ("task_id", "fruit_id", "line_id", "order_id", "job_id", "fault_id", "reservation_id"):
             filled = filled.replace(f"{{{name}}}", ids.get(name, "nobody:1:1"))
         return filled + ("?w=32&h=24" if filled.endswith("hand.jpg") else "")
 

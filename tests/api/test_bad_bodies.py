@@ -70,6 +70,7 @@ GOOD: dict[tuple[str, str, str], dict[str, Any]] = {
     ("sim", "PATCH", "/clock"): {"speed": 3.0, "paused": False},
     ("sim", "POST", "/faults"): {"kind": "wheel_slip", "target": "robot-1", "duration_s": 1.0, "strength": 2.0},
     ("console", "POST", "/api/stop"): {"reason": "a test"},
+    ("console", "POST", "/orders"): {"count": 3, "plant_id": ""},
     ("console", "POST", "/api/plants/{plant_id}/water"): TASK,
 }  # fmt: skip
 """A body that each endpoint takes, with every field it knows: the bad ones are this one, changed in one place."""

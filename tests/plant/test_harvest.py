@@ -209,3 +209,25 @@ def test_the_forecast_counts_what_is_red_and_widens_with_what_is_unknown(play: P
         assert (await garden.call("plant-1", "GET", "/forecast?ahead_s=-1")).status_code == 422
 
     play(story)
+
+
+def test_an_order_that_comes_while_the_pots_own_harvest_runs_is_picked_after_it(play: Play) -> None:
+    async def story(garden: Garden) -> None:
+        robot = garden.picker("robot-1", dict(TREE))
+        garden.pot(ratio=0.3, inventory=True, harvest=True)
+        await until_done(garden, "inventory")
+
+        async def running() -> bool:
+            return any(task["state"] == "running" for task in await tasks_of(garden, "harvest"))
+
+        await garden.until(running, 60.0)
+        order = {"kind": "harvest", "count": 2, "order_id": "o1"}
+        assert (await garden.call("plant-1", "POST", "/tasks", json=order)).status_code == 201
+
+        async def both() -> bool:
+            return [task["state"] for task in await tasks_of(garden, "harvest")] == ["done", "done"]
+
+        await garden.until(both, 120.0)
+        assert len(set(robot.basket)) == len(robot.basket) == 3
+
+    play(story)

@@ -1,0 +1,77 @@
+"""An order: split by what the pots know, put together from their tasks, and honest about what did not come."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from console.orders import Stock, order_of, split
+from core.wire.fruit import Pick
+from core.wire.market import Task
+from core.wire.order import Order, OrderPart
+
+stocks = st.dictionaries(
+    st.sampled_from(["plant-1", "plant-2", "plant-3", "plant-4"]), st.builds(Stock, st.integers(0, 9), st.floats(0, 20))
+)
+
+
+@given(st.integers(1, 40), stocks)
+def test_no_pot_is_asked_for_more_than_it_has_nor_all_for_more_than_is_wanted(count: int, known: dict[str, Stock]) -> None:
+    parts = split(count, known)
+    assert all(0 < parts[name] <= known[name].ripe for name in parts)
+    assert sum(parts.values()) == min(count, sum(stock.ripe for stock in known.values()))
+
+
+def test_those_with_most_ripe_fruit_give_first_and_the_forecast_breaks_ties() -> None:
+    assert split(3, {"a": Stock(1), "b": Stock(5), "c": Stock(2)}) == {"b": 3}
+    assert split(1, {"a": Stock(2, 2.0), "b": Stock(2, 4.5)}) == {"b": 1}
+    assert split(4, {"a": Stock(2), "b": Stock(2)}) == {"a": 2, "b": 2}
+
+
+def task(plant: str, state: Any, picks: int, count: int = 2, **more: Any) -> Task:
+    return Task(
+        task_id=f"{plant}:1:1", kind="harvest", state=state, plant_id=plant, created_s=5.0, updated_s=9.0, count=count,
+        order_id="o1", picks=[Pick(fruit_id=f"f{i}", outcome="picked") for i in range(picks)], **more,
+    )  # fmt: skip
+
+
+def wished(count: int, *parts: OrderPart) -> Order:
+    return Order(order_id="o1", count=count, created_s=5.0, updated_s=5.0, parts=list(parts))
+
+
+def test_an_order_runs_until_every_part_has_ended() -> None:
+    told = order_of("o1", [task("plant-1", "done", 2), task("plant-2", "running", 1)], wished(4))
+    assert told is not None
+    assert (told.state, told.delivered) == ("running", 3)
+    told = order_of("o1", [task("plant-1", "done", 2), task("plant-2", "done", 2)], told)
+    assert told is not None
+    assert (told.state, told.delivered, told.reason) == ("done", 4, "")
+
+
+def test_what_is_missing_is_said_with_the_reason() -> None:
+    short = task("plant-2", "done", 1, reason="1 of 2 picked; f9 unreachable: too high")
+    told = order_of("o1", [task("plant-1", "done", 2), short], wished(5))
+    assert told is not None
+    assert (told.state, told.delivered) == ("partial", 3)
+    assert "too high" in told.reason
+    assert "only 4 of 5" in told.reason
+
+
+def test_a_pot_that_was_silent_or_refused_is_part_of_the_story() -> None:
+    refused = OrderPart(plant_id="plant-3", count=1, state="failed", reason="no ripe fruit is known here")
+    silent = OrderPart(plant_id="plant-1", count=2, task_id="plant-1:1:1", state="running")
+    told = order_of("o1", [], wished(3, silent, refused))
+    assert told is not None
+    assert (told.state, [part.state for part in told.parts]) == ("running", ["silent", "failed"])
+    assert order_of("o1", [], None) is None
+    told = order_of("o1", [task("plant-1", "failed", 0, reason="nobody could")], wished(3, silent, refused))
+    assert told is not None
+    assert told.state == "failed"
+
+
+def test_a_console_that_forgot_an_order_reads_it_from_the_pots() -> None:
+    told = order_of("o1", [task("plant-1", "done", 2, asked_by="operator")])
+    assert told is not None
+    assert (told.count, told.delivered, told.state, told.asked_by) == (2, 2, "done", "operator")
