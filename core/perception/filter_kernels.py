@@ -17,6 +17,8 @@ RADIUS_STEPS = 9
 """Radii that are tried for an outline."""
 ZONES = (0.5, 0.9, 1.15, 1.5, 2.2)
 """Outer radii of middle, rim, outline (not looked at), ring and what lies further, in radii."""
+STRIDE_FROM_PX = 9.0
+"""Zones that reach further are sampled at every second pixel both ways."""
 
 
 @njit(cache=True, fastmath=True)
@@ -24,7 +26,7 @@ def planes(image: Bytes, bins: Bytes, luma: Floats, table: Floats, out: Floats) 
     """Colour planes of an image in one pass.
 
     `bins` (3, 256) and `luma` (3, 256) hold each channel's balanced value as a bin of 0..31 and as its share of brightness;
-    `table` (32768, 2) how likely a colour is red and green fruit. `out` (h, w, 4): red, green, brightness, whiteness.
+    `table` (32768, 2) how likely a colour is red and green fruit. `out` (4, h, w): red, green, brightness, whiteness.
     """
     height, width = image.shape[:2]
     for y in range(height):
@@ -32,11 +34,36 @@ def planes(image: Bytes, bins: Bytes, luma: Floats, table: Floats, out: Floats) 
             b, g, r = image[y, x, 0], image[y, x, 1], image[y, x, 2]
             kb, kg, kr = bins[0, b], bins[1, g], bins[2, r]
             index = (np.int32(kb) << 10) | (np.int32(kg) << 5) | np.int32(kr)
-            out[y, x, 0] = table[index, 0]
-            out[y, x, 1] = table[index, 1]
-            out[y, x, 2] = luma[0, b] + luma[1, g] + luma[2, r]
+            out[0, y, x] = table[index, 0]
+            out[1, y, x] = table[index, 1]
+            out[2, y, x] = luma[0, b] + luma[1, g] + luma[2, r]
             most = max(kb, kg, kr)
-            out[y, x, 3] = np.float32(min(kb, kg, kr)) / np.float32(max(most, 1))
+            out[3, y, x] = np.float32(min(kb, kg, kr)) / np.float32(max(most, 1))
+
+
+@njit(cache=True, fastmath=True)
+def packed(planes: Floats, smooth: Floats, spots: Floats, red_blobs: Floats, green_blobs: Floats) -> Floats:
+    """The maps side by side (h, w, 8), for who looks at one place of all; `planes` (4, h, w), the others (h, w)."""
+    height, width = smooth.shape
+    out = np.empty((height, width, 8), np.float32)
+    for y in range(height):
+        for x in range(width):
+            for k in range(4):
+                out[y, x, k] = planes[k, y, x]
+            out[y, x, 4] = smooth[y, x]
+            out[y, x, 5] = spots[y, x]
+            out[y, x, 6] = red_blobs[y, x]
+            out[y, x, 7] = green_blobs[y, x]
+    return out
+
+
+@njit(cache=True, fastmath=True)
+def bright_colour(maps: Floats, family: int, plane: Floats, source: Floats) -> None:
+    """A colour plane (h, w), and the same weighted by brightness: a ball's middle is brighter than its rim."""
+    for y in range(plane.shape[0]):
+        for x in range(plane.shape[1]):
+            plane[y, x] = maps[y, x, family]
+            source[y, x] = maps[y, x, family] * (np.float32(0.35) + np.float32(0.65) * maps[y, x, 2])
 
 
 @njit(cache=True, fastmath=True)
@@ -70,6 +97,9 @@ def tops(votes: Floats, least: float, most: int) -> Ints:
                 for i in range(max(x - 2, 0), min(x + 3, width)):
                     if votes[j, i] > here:
                         highest = False
+                        break
+                if not highest:
+                    break
             if highest:
                 found[n, 0], found[n, 1], heights[n] = x, y, here
                 n += 1
@@ -89,9 +119,10 @@ def vote(image: Floats, steep: float, radius_min: int, radius_max: int, out: Flo
         for x in range(1, width - 1):
             gx = image[y, x + 1] - image[y, x - 1]
             gy = image[y + 1, x] - image[y - 1, x]
-            size = math.sqrt(gx * gx + gy * gy)
-            if size < steep:
+            square = gx * gx + gy * gy
+            if square < steep * steep:
                 continue
+            size = math.sqrt(square)
             gx /= size
             gy /= size
             for radius in range(radius_min, radius_max + 1):
@@ -144,8 +175,9 @@ def zones(maps: Floats, u: float, v: float, edges: Floats, out: Floats) -> None:
     out[:] = 0
     pixels = np.zeros(zones_n, np.int32)
     outer = edges[-1]
-    for y in range(max(int(v - outer), 0), min(int(v + outer) + 2, height)):
-        for x in range(max(int(u - outer), 0), min(int(u + outer) + 2, width)):
+    stride = 1 if outer < STRIDE_FROM_PX else 2
+    for y in range(max(int(v - outer), 0), min(int(v + outer) + 2, height), stride):
+        for x in range(max(int(u - outer), 0), min(int(u + outer) + 2, width), stride):
             d = (x - u) * (x - u) + (y - v) * (y - v)
             for z in range(zones_n):
                 if d <= edges[z] * edges[z]:

@@ -55,9 +55,6 @@ VOTE_MIN = 0.30
 """Circle votes plus colour at a centre below which it is not looked at."""
 CANDIDATES_MAX = 50
 """A pyramid level and colour."""
-APART = 0.75
-"""Of the larger radius: nearer centres are one fruit."""
-SURE_ENOUGH = 0.5
 
 FAMILIES: tuple[Colour, Colour] = ("red", "green")
 MAPS = ("red", "green", "brightness", "whiteness", "smooth", "highlight", "area_red", "area_green")
@@ -100,6 +97,8 @@ class Weights:
     """(3,): log odds of red against turning: bias, and gains of log red/green and log blue/green in the fruit's middle."""
     sure: NDArray[np.float64]
     """(2,): the confidence from which a candidate of the family is a fruit."""
+    apart: float
+    """Of the larger radius: nearer centres are one fruit."""
 
     def document(self) -> dict[str, Any]:
         """As JSON, rounded."""
@@ -108,8 +107,8 @@ class Weights:
     @classmethod
     def of(cls, document: dict[str, Any]) -> Weights:
         """From JSON; raises KeyError when a part is missing."""
-        arrays = {name: np.array(document[name], float) for name in cls.__slots__ if name != "balance_norm"}
-        return cls(balance_norm=float(document["balance_norm"]), **arrays)
+        arrays = {name: np.array(document[name], float) for name in cls.__slots__ if name not in ("balance_norm", "apart")}
+        return cls(balance_norm=float(document["balance_norm"]), apart=float(document["apart"]), **arrays)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +142,7 @@ def detect(image: Image, weights: Weights, table: Floats) -> list[Detection]:
     seen = Seen(image, weights.balance_norm, table)
     circles, families, confidence = _judged(list(seen.candidates()), weights)
     order = np.argsort(-confidence)
-    kept = order[kernels.distinct(circles[order], APART)]
+    kept = order[kernels.distinct(circles[order], weights.apart)]
     return [_detection(seen, circles[k], int(families[k]), float(confidence[k]), weights) for k in kept]
 
 
@@ -172,19 +171,27 @@ def warm() -> None:
     """Compile the kernels into numba's cache, so that nobody's first picture waits for them."""
     seen = Seen(np.full((240, 320, 3), 90, np.uint8), 1.0, np.zeros((BINS**3, 2), np.float32))
     found = list(seen.candidates())
-    kernels.distinct(np.concatenate([each.circles for each in found]), APART)
+    kernels.distinct(np.concatenate([each.circles for each in found]), 1.0)
 
 
 def _judged(candidates: list[Candidates], weights: Weights) -> tuple[Floats, NDArray[np.int64], NDArray[np.float64]]:
     """Circles, families and confidences of the candidates that are sure enough."""
     circles, families, confidences = [np.zeros((0, 3), np.float32)], [np.zeros(0, np.int64)], [np.zeros(0)]
-    for each in candidates:
+    for family in range(len(FAMILIES)):
+        each = together(candidates, family)
         confidence = confidence_of(each, weights)
         sure = confidence >= weights.sure[each.family]
         circles.append(each.circles[sure])
         families.append(np.full(int(sure.sum()), each.family))
         confidences.append(confidence[sure])
     return np.concatenate(circles), np.concatenate(families), np.concatenate(confidences)
+
+
+def together(candidates: list[Candidates], family: int) -> Candidates:
+    """A family's candidates of all sizes."""
+    mine = [each for each in candidates if each.family == family]
+    circles, features = np.concatenate([each.circles for each in mine]), np.concatenate([each.features for each in mine])
+    return Candidates(family, circles, features)
 
 
 def confidence_of(candidates: Candidates, weights: Weights) -> NDArray[np.float64]:
@@ -236,7 +243,7 @@ def colour_table(colour: NDArray[np.float64]) -> Floats:
 
 def gains_of(image: Image, norm: float) -> NDArray[np.float64]:
     """Factors (3,) that make the image's generalised mean grey (shades of grey: Finlayson and Trezzi 2004)."""
-    sample = image[::4, ::4].reshape(-1, 3).astype(float) / 255
+    sample = image[::6, ::6].reshape(-1, 3).astype(float) / 255
     mean = np.maximum((sample**norm).mean(axis=0) ** (1 / norm), 1e-3)
     level = BRIGHTNESS + 0.15 * (1 - 1 / norm)
     return np.asarray(np.clip(level / mean, *GAIN_RANGE), float)
@@ -254,12 +261,12 @@ class Seen:
         values = np.clip(np.arange(256)[None] / 255 * self.gains[:, None], 0, 1)
         bins = np.minimum(values * BINS, BINS - 1).astype(np.uint8)
         luma = (values * np.array(BGR_LUMA)[:, None]).astype(np.float32)
-        colours = np.empty((*self.image.shape[:2], 4), np.float32)
+        colours = np.empty((4, *self.image.shape[:2]), np.float32)
         kernels.planes(self.image, bins, luma, table, colours)
-        self.red, green, brightness, whiteness = (np.ascontiguousarray(colours[:, :, k]) for k in range(4))
+        self.red, green, brightness, whiteness = colours
         smooth = smoothness(brightness)
-        rest = (smooth, highlights(brightness, whiteness), areas(self.red, smooth), areas(green, smooth))
-        self.maps: Floats = np.concatenate([colours, np.asarray(cv2.merge(rest), np.float32)], axis=2)
+        blobs = (areas(self.red, smooth), areas(green, smooth))
+        self.maps: Floats = kernels.packed(colours, smooth, highlights(brightness, whiteness), *blobs)
         """(h, w, MAPS)"""
 
     def candidates(self) -> Iterator[Candidates]:
@@ -298,8 +305,10 @@ def smoothness(brightness: Floats) -> Floats:
 
 def highlights(brightness: Floats, whiteness: Floats) -> Floats:
     """1 on small white spots: brighter than all around by a step, and colourless."""
-    around = cv2.blur(brightness, (25, 25))
-    step = np.clip((brightness - around - HIGHLIGHT_STEP) * 4, 0, 1) * whiteness
+    height, width = brightness.shape
+    small = cv2.resize(brightness, (max(width // 4, 1), max(height // 4, 1)), interpolation=cv2.INTER_AREA)
+    around = cv2.resize(cv2.blur(small, (7, 7)), (width, height), interpolation=cv2.INTER_LINEAR)
+    step = np.minimum(np.maximum((brightness - around) * 4 - 4 * HIGHLIGHT_STEP, 0), 1) * whiteness
     return np.asarray(cv2.dilate(step, np.ones((3, 3), np.uint8)), np.float32)
 
 
@@ -316,8 +325,8 @@ def areas(plane: Floats, smooth: Floats) -> Floats:
 
 def circle_votes(maps: Floats, family: int) -> tuple[Floats, Floats]:
     """The plane whose discs are looked for (colour, brighter in the middle), and the votes for their centres (h, w)."""
-    plane = np.ascontiguousarray(maps[:, :, family])
-    source = plane * (np.float32(0.35) + np.float32(0.65) * maps[:, :, 2])
+    plane, source = np.empty(maps.shape[:2], np.float32), np.empty(maps.shape[:2], np.float32)
+    kernels.bright_colour(maps, family, plane, source)
     source = np.asarray(cv2.GaussianBlur(source, (3, 3), 0.8), np.float32)
     votes = np.empty_like(source)
     kernels.vote(source, STEEP, *RADII_PX, votes)
