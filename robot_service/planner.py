@@ -8,7 +8,7 @@ from core.allocation.bidding import BATTERY_ENOUGH_RATIO, Travel
 from core.allocation.queue import Entry
 from core.errors import GardenError, PeerDown
 from core.mesh.client import retry
-from core.wire.fruit import Inventory, Pick
+from core.wire.fruit import Fruit, Inventory, Pick
 from core.wire.market import Announcement, Permit, PermitRequest, Report
 from core.wire.robot import JobRequest
 from robot_service.docks import Docks
@@ -122,10 +122,20 @@ class Planner:
                 raise SkillFailed(entry.killed)
 
         before = len(entry.picks)
-        await harvest(self.robot, asked.plant, asked.fruits, wanted, leave, self._keep_picture(asked), ended)
+        known = await self._known(asked)
+        await harvest(self.robot, asked.plant, asked.fruits, wanted, leave, self._keep_picture(asked), ended, known)
         picks = entry.picks[before:]
         if not any(pick.outcome == "picked" for pick in picks):
             raise SkillFailed("; ".join(f"{pick.fruit_id}: {pick.reason}" for pick in picks)[:400] or "nothing to pick")
+
+    async def _known(self, asked: Announcement) -> list[Fruit]:
+        """All fruit of the plant: those that are not to be picked are in the way. Without an answer, what was announced."""
+        plant = self.robot.peers.get(asked.plant.plant_id)
+        try:
+            return (await self.robot.mesh.call(plant, "GET", "/inventory", expect=Inventory)).fruits
+        except GardenError as error:
+            self.robot.note("pick", f"the inventory could not be read, neighbours are unknown: {error}", task_id=asked.task_id)
+            return asked.fruits
 
     def _keep_picture(self, asked: Announcement) -> KeepPicture:
         """Sends pictures to the plant's ledger. Evidence, not the deed: a plant that does not take one changes nothing."""

@@ -65,7 +65,7 @@ def trial(seed: int, detector: str) -> Trial:
 
 
 async def _trial(seed: int, detector: str, folder: Path) -> Trial:
-    settings = {ROBOT: {"ROBOT_DETECTOR": detector}, PLANT: {"PLANT_HARVEST": "false"}}
+    settings = {ROBOT: {"ROBOT_DETECTOR": detector}, PLANT: {"PLANT_HARVEST": "false", "PLANT_INVENTORY": "false"}}
     async with Garden(one_plant(FRUIT), folder, seed=seed, settings=settings) as garden:
         task, _ = await ask(garden, {"kind": "inventory"}, HARVEST_WITHIN_S)
         if task["state"] != "done":

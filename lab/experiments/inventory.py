@@ -62,7 +62,7 @@ def trial(seed: int, detector: str) -> Trial:
 async def _trial(seed: int, detector: str, folder: Path) -> Trial:
     scans: list[Scanned] = []
     failures: list[str] = []
-    settings = {ROBOT: {"ROBOT_DETECTOR": detector}, PLANT: {"PLANT_HARVEST": "false"}}
+    settings = {ROBOT: {"ROBOT_DETECTOR": detector}, PLANT: {"PLANT_HARVEST": "false", "PLANT_INVENTORY": "false"}}
     async with Garden(one_plant(), folder, seed=seed, settings=settings) as garden:
         for _ in range(SCANS):
             task, scan_s = await ask(garden, {"kind": "inventory"}, SCAN_WITHIN_S)
