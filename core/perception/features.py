@@ -31,7 +31,7 @@ Floats: TypeAlias = NDArray[np.float32]
 Ints: TypeAlias = NDArray[np.int32]
 
 WEIGHTS = "features.npz"
-VERSION = 1
+VERSION = 2
 LONG_SIDE_PX = 432
 """Of the finest level of the pyramid."""
 RADIUS_PX = 6.0
@@ -41,7 +41,8 @@ SCALE_STEP = 1.19
 """Each level is so many times smaller than the one before: fruit of 1.4 to 16 % of the image's longer side in radius."""
 BORDER_PX = 22
 """Levels are continued by so much, that fruit at the image's edge are seen: at least offset + half a patch + mask."""
-PLANES = ("grey", "right", "down", "band", "edge")
+PLANES = ("grey", "right", "down", "vivid", "edge")
+"""The same whichever way the image's channels are exchanged: they see how coloured a fruit is, never which colour."""
 SIZES = (5, 9, 13)
 """Sides of patches [px of a level]."""
 ALL_WINDOWS = frozenset((plane, which) for plane in range(len(PLANES)) for which in range(len(SIZES)))
@@ -197,35 +198,38 @@ def warm() -> None:
 
 def levels(image: Image, windows: frozenset[tuple[int, int]] = ALL_WINDOWS) -> Iterator[Level]:
     """The pyramid, the finest level (the smallest fruit) first. `windows`: plane and size index of the norms needed."""
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    height, width = grey.shape
+    height, width = image.shape[:2]
     base: Floats | None = None
     for k in range(SCALES):
         scale = LONG_SIDE_PX / max(height, width) / SCALE_STEP**k
         size = (max(round(width * scale), 1), max(round(height * scale), 1))
-        source = grey if base is None else base
+        source = image if base is None else base
         how = cv2.INTER_AREA if size[0] < source.shape[1] else cv2.INTER_LINEAR
-        small = cv2.resize(source, size, interpolation=how).astype(np.float32)
+        small = np.asarray(cv2.resize(source, size, interpolation=how), np.float32)
         if base is None:
             small /= 255
             base = small
-        planes = planes_of(np.asarray(small, np.float32))
+        planes = planes_of(small)
         yield Level(zoom=1 / scale, shape=(size[1], size[0]), planes=planes, weights=norms_of(planes, windows))
 
 
-def planes_of(grey: Floats) -> Floats:
-    """Brightness (h, w) 0..1 -> PLANES (5, h + border, w + border).
+def planes_of(bgr: Floats) -> Floats:
+    """An image (h, w, 3) 0..1 -> PLANES (5, h + border, w + border).
 
-    Smoothed a little; slopes right and down; what is left between a fine and a coarse smoothing; the slopes' length.
+    The channels' mean, smoothed a little; its slopes right and down; the most less the least channel; the length of the
+    steepest channel's slope.
     """
-    wide = cv2.copyMakeBorder(grey, *(BORDER_PX,) * 4, cv2.BORDER_REPLICATE)
-    smooth = cv2.GaussianBlur(wide, (3, 3), 0.7)
-    out = np.empty((len(PLANES), *wide.shape), np.float32)
-    out[0] = smooth
-    out[1] = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.25)
-    out[2] = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.25)
-    out[3] = smooth - cv2.GaussianBlur(wide, (0, 0), 2.5)
-    out[4] = cv2.magnitude(out[1], out[2])
+    smooth = cv2.GaussianBlur(cv2.copyMakeBorder(bgr, *(BORDER_PX,) * 4, cv2.BORDER_REPLICATE), (3, 3), 0.7)
+    b, g, r = cv2.split(smooth)
+    out = np.empty((len(PLANES), *smooth.shape[:2]), np.float32)
+    out[0] = (b + g + r) * np.float32(1 / 3)
+    out[1] = cv2.Sobel(out[0], cv2.CV_32F, 1, 0, scale=0.25)
+    out[2] = cv2.Sobel(out[0], cv2.CV_32F, 0, 1, scale=0.25)
+    out[3] = np.maximum(np.maximum(b, g), r) - np.minimum(np.minimum(b, g), r)
+    across = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.25)
+    along = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.25)
+    steep = cv2.split(across * across + along * along)
+    out[4] = np.sqrt(np.maximum(np.maximum(steep[0], steep[1]), steep[2]))
     return out
 
 

@@ -18,7 +18,7 @@ from core.perception.detection import Detection, Image
 from core.perception.registry import DETECTORS, detector
 from lab.reproduce import load_object
 
-STAGES = {"filter": "core.perception.filters:stages"}
+STAGES = {"filter": "core.perception.filters:stages", "features": "core.perception.features:stages"}
 """Detectors that can be looked into: a function (image) -> pictures by name, (h, w, 3) uint8 or maps (h, w) of 0..1."""
 INK = {"red": (40, 40, 255), "turning": (0, 190, 255), "green": (60, 255, 60)}
 

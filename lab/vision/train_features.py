@@ -31,17 +31,17 @@ Bytes: TypeAlias = NDArray[np.uint8]
 Ints: TypeAlias = NDArray[np.int32]
 Tell = Callable[[str], None]
 
-DICTIONARY = 1200
+DICTIONARY = 800
 """Random patches to choose from."""
 STRONGEST = 40
-STUMPS = 160
+STUMPS = 200
 """Altogether: after the forty patches are chosen, boosting goes on with those alone."""
-SHRINK = 0.6
+SHRINK = 0.5
 """Of each stump: many small steps overfit less (Friedman 2001)."""
 SPREAD = 9
 """Patches lie this near the fruit's centre [px of a level]."""
-RANDOM_NEGATIVES = 25
-MINED = (30, 30)
+RANDOM_NEGATIVES = 15
+MINED = (25, 25)
 """Background learnt from, of an image: drawn anywhere at first, then what the last detector found wrongly, at most."""
 KEPT_SHARE = 0.2
 """Of the training groups, to decide the margin."""
@@ -49,7 +49,7 @@ CENTRAL, CENTRAL_MAX = 0.35, 0.75
 """In half sizes from a box's centre: within the first it is the fruit, beyond the second it is background."""
 RATIO, RATIO_MAX = 1.25, 1.8
 """Of radii: likewise."""
-FLOOR_SHARE = 0.015
+FLOOR_SHARE = 0.01
 """Of the fruit that would be found at last, how many a step of the cascade may give up."""
 
 
@@ -104,7 +104,7 @@ def train(data: Sequence[Path], out: Path | None, seed: int, progress: Tell) -> 
     for source in sorted({p.path.parent for p in parts.validation}):
         judged = evaluate(features.with_model(model), [p for p in parts.validation if p.path.parent == source])
         scores = ", ".join(f"{name} P {c.precision:.3f} R {c.recall:.3f} F1 {c.f1:.3f}" for name, c in judged.counts.items())
-        progress(f"{source.name}: {judged.images} images: {scores}; {judged.ms_per_frame:.0f} ms a frame")
+        progress(f"{source.parent.name}: {judged.images} images: {scores}; {judged.ms_per_frame:.0f} ms a frame")
 
 
 def scene(photograph: dataset.Photograph) -> Scene:
@@ -116,12 +116,19 @@ def fitted(scenes: Sequence[Scene], seed: int, progress: Tell) -> Model:
     rng = np.random.default_rng(seed)
     learnt, kept = _parted(scenes, rng)
     dictionary = drawn(learnt, DICTIONARY, rng)
-    samples = _together([_first(one, dictionary, rng) for one in learnt])
-    model = boosted(samples, dictionary, seed, progress)
+    samples = _together([_first(each, dictionary, rng) for one in learnt for each in (one, mirrored(one))])
+    model = boosted(samples, dictionary, progress)
     for most in MINED:
         samples += _together([_mined(one, model, dictionary, most) for one in learnt])
-        model = boosted(samples, dictionary, seed, progress)
+        model = boosted(samples, dictionary, progress)
     return replace(_decided(model, kept, progress), colour=_colour(scenes))
+
+
+def mirrored(one: Scene) -> Scene:
+    """The scene, left and right exchanged."""
+    width = one.image.shape[1]
+    boxes = tuple(replace(box, x_px=width - box.x_px - box.width_px) for box in one.boxes)
+    return replace(one, boxes=boxes, image=np.ascontiguousarray(one.image[:, ::-1]))
 
 
 def _parted(scenes: Sequence[Scene], rng: np.random.Generator) -> tuple[list[Scene], list[Scene]]:
@@ -260,7 +267,7 @@ def _together(parts: Sequence[Samples]) -> Samples:
 # Boosting.
 
 
-def boosted(samples: Samples, dictionary: Dictionary, seed: int, progress: Tell) -> Model:
+def boosted(samples: Samples, dictionary: Dictionary, progress: Tell) -> Model:
     """Gentle boosting (Friedman, Hastie and Tibshirani 2000) over stumps: first STRONGEST patches, then on with those."""
     base = _balance(samples)
     margin = np.zeros(len(base), np.float32)

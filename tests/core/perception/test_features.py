@@ -95,10 +95,22 @@ def test_a_point_that_falls_below_a_floor_is_given_up(level, model):
     assert margins[0] == feature_kernels.GIVEN_UP
 
 
-def test_fruit_are_found_by_shape_and_not_by_colour(painted, model):
+def test_balls_are_found_where_they_are(painted):
+    image, balls = painted
+    found = features.features_detector()(image)
+    hit = sum(
+        any(np.hypot(d.u_px - u, d.v_px - v) < r / 2 and 0.5 < d.radius_px / r < 2 for d in found) for u, v, r in balls
+    )
+    assert hit >= 3
+    assert all(0 < d.confidence < 1 for d in found)
+    assert [d.confidence for d in found] == sorted((d.confidence for d in found), reverse=True)
+
+
+@pytest.mark.parametrize("channels", [(0, 2, 1), (2, 1, 0), (1, 2, 0)])
+def test_fruit_are_found_whatever_their_colour(painted, model, channels):
     image, _ = painted
-    grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
-    np.testing.assert_array_equal(features.found(image, model)[0], features.found(grey, model)[0])
+    other = np.ascontiguousarray(image[:, :, list(channels)])
+    np.testing.assert_allclose(features.found(other, model)[0], features.found(image, model)[0])
 
 
 def test_there_is_nothing_to_see_in_a_black_image(model):
