@@ -134,7 +134,7 @@ class Planner:
         try:
             return (await self.robot.mesh.call(plant, "GET", "/inventory", expect=Inventory)).fruits
         except GardenError as error:
-            self.robot.note("pick", f"the inventory could not be read, neighbours are unknown: {error}", task_id=asked.task_id)
+            self.robot.note("pick", f"neighbours are unknown, no inventory: {error}", task_id=asked.task_id)
             return asked.fruits
 
     def _keep_picture(self, asked: Announcement) -> KeepPicture:

@@ -27,8 +27,8 @@ STEP_M = 0.015
 OPENING_SLACK_M = 0.006
 """The fingers open this much wider than the fruit on either side: room for error, none for its neighbour."""
 PITCHES_RAD = tuple(math.radians(d) for d in range(-54, 73, 6))
-ROOM_M_MIN = -0.006
-"""A fruit gives way by so much on its stalk and comes to no harm; with less room the hand stays away."""
+ROOM_M_MIN = -0.004
+"""A fruit gives way by so much on its stalk and slides along the finger; with less room the hand stays away."""
 ROOM_ENOUGH_M = 0.012
 """More room than this to a neighbour is worth nothing."""
 
@@ -45,12 +45,12 @@ class Part:
 
 
 HAND_PARTS = (
-    Part(front_m=0.014, half_width_m=0.008, beside_opening=True, low_m=-0.012, high_m=0.012),
-    Part(front_m=-0.010, half_width_m=0.014, beside_opening=True, low_m=-0.006, high_m=0.006),
+    Part(front_m=0.015, half_width_m=0.005, beside_opening=True, low_m=-0.0105, high_m=0.0105),
+    Part(front_m=-0.012, half_width_m=0.005, beside_opening=True, low_m=-0.006, high_m=0.006),
     Part(front_m=-0.075, half_width_m=0.011, beside_opening=False, low_m=-0.022, high_m=0.011),
     Part(front_m=-0.100, half_width_m=0.018, beside_opening=False, low_m=0.030, high_m=0.060),
 )
-"""Pads, rails, palm with the hose, camera."""
+"""Finger tips, fingers, palm with the hose, camera."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

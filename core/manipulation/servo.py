@@ -6,7 +6,7 @@ y down. The fruit is a ball of known radius, which is what makes its apparent ra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -76,10 +76,14 @@ class Target:
     p_base: Array
     P: Array
     radius_m: float = FRUIT_RADIUS_M
+    expected_p: Array = field(default_factory=lambda: np.zeros(3))
+    """Where it was expected before it was seen [m]."""
+    sightings: int = 0
 
     @classmethod
     def expected(cls, p_base: Array, sigma_m: float, radius_m: float) -> Target:
-        return cls(p_base=np.asarray(p_base, dtype=np.float64), P=np.eye(3) * sigma_m**2, radius_m=radius_m)
+        p = np.asarray(p_base, dtype=np.float64)
+        return cls(p_base=p, P=np.eye(3) * sigma_m**2, radius_m=radius_m, expected_p=p)
 
     def features(self, camera: Camera, T_base_cam: Array) -> Array:
         """(u, v, r) [px] where it should appear now; raises Unprocessable when it is behind the camera."""
@@ -108,6 +112,7 @@ class Target:
 
     def see(self, camera: Camera, T_base_cam: Array, seen: Array) -> None:
         """Take a sighting (u, v, r) [px] into account."""
+        self.sightings += 1
         z, H = self._linear(camera, T_base_cam)
         K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + _noise(z))
         self.p_base = self.p_base + K @ (seen - z)

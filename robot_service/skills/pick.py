@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from core.errors import Refused
+from core.errors import Refused, Unprocessable
 from core.manipulation.approach import (
     LOOK_M,
     READY_M,
@@ -22,6 +22,7 @@ from core.manipulation.approach import (
     Obstacle,
     approaches,
     opening_for,
+    room_m,
     way_in,
 )
 from core.manipulation.arm import Joints, Point3, inverse
@@ -61,8 +62,8 @@ GRIP_N_MAX = 9.0
 CLOSE_S = 0.6
 CLOSE_TICK_M = 0.004
 GRASPS_MAX = 2
-FAST_SHARE = 0.5
-PULL_SHARE = 0.15
+FAST_SHARE, ADVANCE_SHARE, PULL_SHARE = 0.5, 0.2, 0.15
+"""Of a servo's top speed: through the air, in among the fruit, and with one in hand."""
 TWIST_RAD = 0.30
 """The hand tips up while it pulls: the stalk bends over its knuckle and breaks at less force."""
 RELEASE_S = 0.4
@@ -156,16 +157,45 @@ async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit]) -> Pick:
         if not ways:
             return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason="other fruit hangs in the way of the hand")
         for way in ways[:WAYS_MAX]:
-            target = _expected(task, fruit)
+            target, near = _expected(task, fruit), [_expected(task, other) for other in others]
             try:
                 await _swing(task.robot, way.look, way.opening_m)
-                why = await servo(task.robot, way.pitch_rad, target, fruit, _place(task, fruit))
+                why = await servo(task.robot, way.pitch_rad, target, fruit, _place(task, fruit), near)
             except Refused as error:
                 why = reason_unless_halted(error)
+            if not why and not _room_to(way, target, near):
+                why = "seen from near, other fruit hangs in the way of the hand"
             if not why:
                 return await _take(task, fruit, way, target)
     why = f"looked from {PLACES_MAX} places and several sides: {why}"
     return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason=why[:500])
+
+
+def _room_to(way: Approach, target: Target, near: Sequence[Target]) -> bool:
+    """Whether the hand may go on, by what was seen of the neighbours on the way."""
+    others = [Obstacle(centre=_point(other.p_base), radius_m=other.radius_m) for other in near]
+    return room_m(_point(target.p_base), way.pitch_rad, way.opening_m, others) >= ROOM_M_MIN
+
+
+def _learn_neighbours(robot: Robot, look: Look, mine: Detection, target: Target, near: Sequence[Target], T: Array) -> None:
+    """The other circles belong to the neighbours; what all of them share is the error of the base's own pose."""
+    shift = target.p_base - target.expected_p
+    free = [circle for circle in look.detections if circle is not mine]
+    for other in near:
+        guess = replace(other, p_base=other.p_base + (shift if other.sightings == 0 else 0.0))
+        scored = [(_distance2(robot, guess, circle, T), index) for index, circle in enumerate(free)]
+        distance2, index = min(scored, default=(math.inf, -1))
+        if distance2 < GATE_CHI2:
+            circle = free.pop(index)
+            other.p_base = guess.p_base
+            other.see(robot.eye.camera, T, np.array([circle.u_px, circle.v_px, circle.radius_px]))
+
+
+def _distance2(robot: Robot, target: Target, circle: Detection, T: Array) -> float:
+    try:
+        return target.distance2(robot.eye.camera, T, np.array([circle.u_px, circle.v_px, circle.radius_px]))
+    except Unprocessable:
+        return math.inf
 
 
 def reason_unless_halted(error: Refused) -> str:
@@ -194,7 +224,9 @@ async def _shift(robot: Robot, side_m: float) -> None:
     await robot.pause(SETTLE_S)
 
 
-async def servo(robot: Robot, pitch_rad: float, target: Target, fruit: Fruit, place: Point3) -> str:
+async def servo(
+    robot: Robot, pitch_rad: float, target: Target, fruit: Fruit, place: Point3, near: Sequence[Target] = ()
+) -> str:
     """Bring the hand to `READY_M` before the fruit by what the camera sees; why it did not, or empty.
 
     Image-based: the features' error through the inverse interaction matrix gives the camera's next step; the distance in
@@ -212,6 +244,7 @@ async def servo(robot: Robot, pitch_rad: float, target: Target, fruit: Fruit, pl
             continue
         blind = 0
         target.see(robot.eye.camera, T_base_cam, np.array([circle.u_px, circle.v_px, circle.radius_px]))
+        _learn_neighbours(robot, look, circle, target, near, T_base_cam)
         if float(np.linalg.norm(target.p_base - np.array(place))) > FAR_OFF_M + FAR_OFF_SIGMAS * fruit.sigma_m:
             return "what the camera sees hangs too far from where the inventory has the fruit"
         gap = T_base_cam[:3, :3].T @ (target.p_base - T_base_cam[:3, 3]) - GOAL_IN_CAMERA_M
@@ -254,11 +287,7 @@ def best_match(
 ) -> Detection | None:
     """The detection that is most likely the target, within its gate; never of the opposite colour."""
     opposite = {"red": "green", "green": "red"}.get(colour)
-    scored = [
-        (target.distance2(robot.eye.camera, T_base_cam, np.array([c.u_px, c.v_px, c.radius_px])), index)
-        for index, c in enumerate(circles)
-        if c.colour != opposite
-    ]
+    scored = [(_distance2(robot, target, c, T_base_cam), index) for index, c in enumerate(circles) if c.colour != opposite]
     within = [pair for pair in scored if pair[0] < GATE_CHI2]
     return circles[min(within)[1]] if within else None
 
@@ -305,7 +334,7 @@ def _reversed_way(target: Target, way: Approach) -> list[Joints]:
 async def _grasp(robot: Robot, way: Approach, target: Target) -> bool:
     """Advance straight onto the fruit and close; whether the force sensor feels it."""
     opening_m = opening_for(target.radius_m)
-    await _go_along(robot, way_in(_point(target.p_base), way.pitch_rad, READY_M, 0.0), FAST_SHARE, opening_m)
+    await _go_along(robot, way_in(_point(target.p_base), way.pitch_rad, READY_M, 0.0), ADVANCE_SHARE, opening_m)
     await close_gripper(robot)
     force_n = robot.state().force_n
     if force_n is None:

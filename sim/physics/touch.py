@@ -22,7 +22,10 @@ MIDDLE_RAD = math.radians(18.0)
 """Within this angle of straight ahead both switches close."""
 
 ARM_PARTS = frozenset(
-    ("pan-hub", "upper-arm", "forearm", "palm", "hose", "rail-left", "rail-right", "pad-left", "pad-right")
+    (
+        *("pan-hub", "upper-arm", "forearm", "palm", "hose"),
+        *("rail-left", "rail-right", "shell-left", "shell-right", "pad-left", "pad-right"),
+    )
 )
 
 Key = tuple[str, str]

@@ -51,6 +51,8 @@ REAR_CASTER_X_M = -0.150
 REAR_CASTER_RADIUS_M = 0.025
 
 FINGER_N_MAX = 12.0
+SHELL_FRICTION = [0.2, 0.005, 0.0001]
+"""Fingers are rubber inside and smooth outside: they slide between fruit, and past them."""
 JOINT_KP = {"pan": 60.0, "shoulder": 80.0, "elbow": 60.0, "wrist": 20.0, "roll": 20.0}
 JOINT_KV = {"pan": 3.0, "shoulder": 4.0, "elbow": 2.5, "wrist": 0.6, "roll": 0.6}
 
@@ -176,12 +178,16 @@ def _hand(spec: Any, hand: Any, wrist: Any, name: str) -> None:
         finger = wrist.add_body(name=f"{name}/finger-{side}", pos=[0.05, 0, 0], gravcomp=1)
         finger.add_joint(name=f"{name}/finger-{side}", type=SLIDE, axis=[0, sign, 0], range=[0.0, g.GRIPPER_OPEN_M / 2],
                          limited=True, armature=0.01, damping=2.0)  # fmt: skip
-        finger.add_geom(name=f"{name}/rail-{side}", type=BOX, size=[0.035, 0.003, 0.006], pos=[0.035, sign * 0.011, 0],
-                        mass=0.015, rgba=DARK, group=VISUAL_GROUP, **AN_ARM)  # fmt: skip
-        finger.add_geom(name=f"{name}/pad-{side}", type=BOX, size=[0.014, 0.004, 0.012], pos=[0.08, sign * 0.004, 0],
-                        mass=0.010, rgba=DARK, group=VISUAL_GROUP, condim=4, friction=GRIP_FRICTION, solref=GRIP_SOLREF,
+        finger.add_geom(name=f"{name}/rail-{side}", type=BOX, size=[0.034, 0.0015, 0.006], pos=[0.034, sign * 0.0035, 0],
+                        mass=0.015, rgba=DARK, group=VISUAL_GROUP, friction=SHELL_FRICTION, priority=2,
+                        **AN_ARM)  # fmt: skip
+        finger.add_geom(name=f"{name}/shell-{side}", type=BOX, size=[0.0145, 0.001, 0.0105], pos=[0.0805, sign * 0.004, 0],
+                        mass=0.002, rgba=DARK, group=VISUAL_GROUP, friction=SHELL_FRICTION, priority=2,
+                        **AN_ARM)  # fmt: skip
+        finger.add_geom(name=f"{name}/pad-{side}", type=BOX, size=[0.0135, 0.0015, 0.010], pos=[0.08, sign * 0.0015, 0],
+                        mass=0.008, rgba=DARK, group=VISUAL_GROUP, condim=4, friction=GRIP_FRICTION, solref=GRIP_SOLREF,
                         solimp=GRIP_SOLIMP, priority=2, **AN_ARM)  # fmt: skip
-        finger.add_site(name=f"{name}/pad-{side}", type=BOX, size=[0.016, 0.006, 0.014], pos=[0.08, sign * 0.004, 0],
+        finger.add_site(name=f"{name}/pad-{side}", type=BOX, size=[0.016, 0.003, 0.013], pos=[0.08, 0, 0],
                         group=SITE_GROUP)  # fmt: skip
         sensor = spec.add_sensor(name=f"{name}/touch-{side}", type=mujoco.mjtSensor.mjSENS_TOUCH,
                                  objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{name}/pad-{side}")  # fmt: skip

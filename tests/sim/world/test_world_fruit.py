@@ -187,7 +187,7 @@ def test_a_fruit_is_gripped_with_six_newtons_torn_off_by_force_and_laid_into_the
     assert (laid.where, laid.robot_id) == ("basket", ROBOT)
     robot = world.truth().robot(ROBOT)
     assert robot.torn_gripped.red == 1
-    world.advance(3.0)
+    world.advance(6.0)
     assert world.at_rest
     quiet(world)
 
