@@ -169,6 +169,7 @@ class _Maker:
             "ROBOT_BODY_URL": self._place.socket(robot.id),
             "ROBOT_BODY_SECRET_FILE": str(self._place.keys(robot.id) / "body.secret"),
             "ROBOT_CREATE": robot.create,
+            "ROBOT_WRIST": robot.wrist,
             "ROBOT_CAMERA_URL": f"{self._urls['sim']}/cameras/{robot.id}/hand.jpg",
             "ROBOT_DOCKING": robot.docking,
             "ROBOT_HOME": _json(robot.home),

@@ -31,6 +31,8 @@ class RobotSettings(BaseSettings):
     body_secret: str = ""
     body_secret_file: Path | None = None
     create: Literal["create1", "create2"] = "create2"
+    wrist: Literal["plain", "roll"] = "plain"
+    """`roll`: a fifth servo turns the fingers about the hand's axis."""
     docking: Literal["seek-dock", "beam"] = "seek-dock"
     localisation: Literal["kalman", "exponential"] = "kalman"
     camera_url: str = ""

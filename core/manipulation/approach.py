@@ -27,6 +27,8 @@ STEP_M = 0.015
 OPENING_SLACK_M = 0.006
 """The fingers open this much wider than the fruit on either side: room for error, none for its neighbour."""
 PITCHES_RAD = tuple(math.radians(d) for d in range(-54, 73, 6))
+ROLLS_RAD = tuple(math.radians(d) for d in (0, 30, -30, 60, -60, 90))
+"""For a wrist that rolls."""
 ROOM_M_MIN = -0.004
 """A fruit gives way by so much on its stalk and slides along the finger; with less room the hand stays away."""
 ROOM_ENOUGH_M = 0.012
@@ -67,6 +69,7 @@ class Approach:
 
     pitch_rad: float
     opening_m: float
+    roll_rad: float
     path: tuple[Joints, ...]
     room_m: float
     """Between the hand and the nearest neighbour; negative when it would be pushed."""
@@ -108,25 +111,34 @@ def way_in(fruit: Point3, pitch_rad: float, from_m: float = LOOK_M, to_m: float 
     return tuple(path)
 
 
-def room_m(fruit: Point3, pitch_rad: float, opening_m: float, others: Sequence[Obstacle]) -> float:
-    """The least distance between the hand, anywhere on its way in, and another fruit's skin [m]."""
+def room_m(fruit: Point3, pitch_rad: float, opening_m: float, others: Sequence[Obstacle], roll_rad: float = 0.0) -> float:
+    """The least distance between the hand, anywhere on its way in, and another fruit's skin [m].
+
+    Roll turns the fingers about the hand's axis; palm and camera stay.
+    """
+    c, s = math.cos(roll_rad), math.sin(roll_rad)
     bearing = math.atan2(fruit[1], fruit[0] - SHOULDER_X_M)
     least = math.inf
     for other in others:
         x, y, z = _in_hand(fruit, bearing, pitch_rad, other.centre)
         for part in HAND_PARTS:
+            across, up = (c * y + s * z, c * z - s * y) if part.beside_opening else (y, z)
             ahead = x - part.front_m
             if ahead > other.radius_m or ahead < -LOOK_M - HAND_M:
                 continue
             half_y = part.half_width_m + (opening_m / 2 if part.beside_opening else 0.0)
             middle, half_z = (part.low_m + part.high_m) / 2, (part.high_m - part.low_m) / 2
-            off = _off(abs(y) - half_y, abs(z - middle) - half_z)
+            off = _off(abs(across) - half_y, abs(up - middle) - half_z)
             least = min(least, math.hypot(max(off, 0.0), ahead) - other.radius_m if ahead > 0 else off - other.radius_m)
     return least
 
 
-def approaches(fruit: Point3, radius_m: float, others: Sequence[Obstacle]) -> list[Approach]:
+def approaches(
+    fruit: Point3, radius_m: float, others: Sequence[Obstacle], rolls_rad: Sequence[float] = (0.0,)
+) -> list[Approach]:
     """Every way that the arm can go, the best first: most room to the neighbours, then the least pitch.
+
+    Of each pitch the roll with the most room, among those that the wrist has.
 
     Raises Refused with the reason of the pitch that came nearest to working when there is none.
     """
@@ -139,8 +151,9 @@ def approaches(fruit: Point3, radius_m: float, others: Sequence[Obstacle]) -> li
         except Refused as refusal:
             why = why or refusal
             continue
-        room = room_m(fruit, pitch_rad, opening_m, others)
-        found.append(Approach(pitch_rad=pitch_rad, opening_m=opening_m, path=path, room_m=room))
+        rooms = {roll: room_m(fruit, pitch_rad, opening_m, others, roll) for roll in rolls_rad}
+        roll = max(rolls_rad, key=lambda turn: (min(rooms[turn], ROOM_ENOUGH_M), -abs(turn)))
+        found.append(Approach(pitch_rad=pitch_rad, opening_m=opening_m, roll_rad=roll, path=path, room_m=rooms[roll]))
     if not found:
         raise Refused(f"no way of the hand to the fruit: {why}", hint="another dock or robot may reach it")
     return sorted(found, key=lambda a: (-min(a.room_m, ROOM_ENOUGH_M), abs(a.pitch_rad)))

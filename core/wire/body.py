@@ -40,6 +40,8 @@ class Setpoint:
     arm_s: float = 0.0
     """Seconds the group move should take, counted from when this goal first appeared."""
     gripper_m: float | None = None
+    roll_rad: float | None = None
+    """Turn of the fingers about the hand's axis, on a robot whose wrist rolls; None holds it."""
     pump: bool = False
     permit_id: str = ""
     """The plant's permit under which the pump runs."""

@@ -100,6 +100,8 @@ class Actuators:
             moved |= _pulses(command.arm)
         if command.gripper_m is not None and command.gripper_m != said.gripper_m:
             moved |= _gripper_pulse(command.gripper_m)
+        if command.roll_rad is not None and command.roll_rad != said.roll_rad:
+            moved[gardener.ROLL_SERVO.channel] = gardener.ROLL_SERVO.pulse_us(command.roll_rad)
         if moved:
             duration_s = command.arm_s if command.arm is not None else _GRIPPER_S
             self._servos.move(moved, duration_s)

@@ -42,6 +42,7 @@ class Command:
     """None stops the arm where it is."""
     arm_s: float = 0.0
     gripper_m: float | None = None
+    roll_rad: float | None = None
     pump: bool = False
 
 
@@ -107,18 +108,21 @@ def check(setpoint: Setpoint | None, state: GateState, now_s: float) -> Verdict:
     if setpoint is None or not 0.0 <= now_s - state.heard_s <= LIFE_S:
         return Verdict()
     if why := _nothing_moves(setpoint, state, now_s):
-        return Verdict(refusals=(why,) if _wants_anything(setpoint) else ())
+        return Verdict(refusals=(why,) if wants_anything(setpoint) else ())
     refusals: list[str] = []
     base, v, omega = _base(setpoint, state, refusals)
     arm, arm_s = _arm(setpoint, state, refusals)
-    gripper_m = _gripper(setpoint, refusals)
+    gripper_m, roll_rad = _gripper(setpoint, refusals), _roll(setpoint, refusals)
     pump, debit_ml = _pump(setpoint, state, refusals)
-    command = Command(base=base, v_mps=v, omega_radps=omega, arm=arm, arm_s=arm_s, gripper_m=gripper_m, pump=pump)
+    hand = {"gripper_m": gripper_m, "roll_rad": roll_rad}
+    command = Command(base=base, v_mps=v, omega_radps=omega, arm=arm, arm_s=arm_s, **hand, pump=pump)
     return Verdict(command=command, refusals=tuple(refusals), debit_ml=debit_ml)
 
 
-def _wants_anything(setpoint: Setpoint) -> bool:
-    return setpoint.base != "stop" or setpoint.pump or setpoint.arm is not None or setpoint.gripper_m is not None
+def wants_anything(setpoint: Setpoint) -> bool:
+    """Whether anything shall move."""
+    moves = (setpoint.arm, setpoint.gripper_m, setpoint.roll_rad)
+    return setpoint.base != "stop" or setpoint.pump or any(goal is not None for goal in moves)
 
 
 def _nothing_moves(setpoint: Setpoint, state: GateState, now_s: float) -> str:
@@ -140,8 +144,7 @@ def _nothing_moves(setpoint: Setpoint, state: GateState, now_s: float) -> str:
 
 def _finite(setpoint: Setpoint) -> bool:
     numbers = [setpoint.v_mps, setpoint.omega_radps, setpoint.arm_s, setpoint.dose_ml, *(setpoint.arm or ())]
-    if setpoint.gripper_m is not None:
-        numbers.append(setpoint.gripper_m)
+    numbers += [goal for goal in (setpoint.gripper_m, setpoint.roll_rad) if goal is not None]
     return all(map(math.isfinite, numbers))
 
 
@@ -214,6 +217,14 @@ def _gripper(setpoint: Setpoint, refusals: list[str]) -> float | None:
     if opening_m is None or 0.0 <= opening_m <= gardener.GRIPPER_OPEN_M:
         return opening_m
     refusals.append(f"a gripper opening of {opening_m:g} m is outside 0 .. {gardener.GRIPPER_OPEN_M:g} m")
+    return None
+
+
+def _roll(setpoint: Setpoint, refusals: list[str]) -> float | None:
+    roll_rad, servo = setpoint.roll_rad, gardener.ROLL_SERVO
+    if roll_rad is None or servo.min_rad <= roll_rad <= servo.max_rad:
+        return roll_rad
+    refusals.append(f"a roll of {roll_rad:g} rad is outside {servo.min_rad:.2f} .. {servo.max_rad:.2f} rad")
     return None
 
 

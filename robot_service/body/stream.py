@@ -17,6 +17,7 @@ from core.clock import Clock
 from core.errors import ConfigError, GardenError, LinkDown, Unauthorised, Unprocessable
 from core.wire.body import BodyState, Control, Hello, LineBuffer, Setpoint, decode, encode
 from hw.links import READ_BYTES_MAX, ByteLink, StreamLink
+from robot_service.body.gate import wants_anything
 
 HELLO_WITHIN_S = 2.0
 KNOCKING_MAX = 8
@@ -183,7 +184,7 @@ class BrainPort:
         message = decode(line)
         if isinstance(message, Setpoint):
             self.setpoint, self.heard_s = message, self._clock.now()
-            if message.base != "stop" or message.pump or message.arm is not None or message.gripper_m is not None:
+            if wants_anything(message):
                 self._woken()
         elif isinstance(message, Control):
             self._ordered(message)

@@ -17,11 +17,11 @@ from core.manipulation.approach import (
     LOOK_M,
     READY_M,
     RETREAT_M,
+    ROLLS_RAD,
     ROOM_M_MIN,
     Approach,
     Obstacle,
     approaches,
-    opening_for,
     room_m,
     way_in,
 )
@@ -84,6 +84,23 @@ class Task:
     keep_picture: KeepPicture
 
 
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """What the fingers do on a way: their opening [m] and their turn about the hand's axis [rad]."""
+
+    opening_m: float
+    roll_rad: float
+
+
+def _roll(robot: Robot, grip: Grip) -> float | None:
+    """The turn for a wrist that rolls; None for one that cannot."""
+    return grip.roll_rad if robot.settings.wrist == "roll" else None
+
+
+def _rolls(robot: Robot) -> tuple[float, ...]:
+    return ROLLS_RAD if robot.settings.wrist == "roll" else (0.0,)
+
+
 async def harvest(
     robot: Robot,
     plant: PlantCard,
@@ -134,7 +151,7 @@ def _outermost(task: Task, left: Sequence[Fruit], hanging: Sequence[Fruit]) -> F
     def room(fruit: Fruit) -> float:
         others = [other for other in hanging if other.fruit_id != fruit.fruit_id]
         try:
-            return approaches(_place(task, fruit), fruit.radius_m, _obstacles(task, others))[0].room_m
+            return approaches(_place(task, fruit), fruit.radius_m, _obstacles(task, others), _rolls(task.robot))[0].room_m
         except Refused:
             return -1.0
 
@@ -148,7 +165,7 @@ async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit]) -> Pick:
         if place:
             await _shift(task.robot, _place(task, fruit)[1])
         try:
-            ways = approaches(_place(task, fruit), fruit.radius_m, _obstacles(task, others))
+            ways = approaches(_place(task, fruit), fruit.radius_m, _obstacles(task, others), _rolls(task.robot))
         except Refused as error:
             if place:
                 break
@@ -159,7 +176,7 @@ async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit]) -> Pick:
         for way in ways[:WAYS_MAX]:
             target, near = _expected(task, fruit), [_expected(task, other) for other in others]
             try:
-                await _swing(task.robot, way.look, way.opening_m)
+                await _swing(task.robot, way.look, Grip(way.opening_m, way.roll_rad))
                 why = await servo(task.robot, way.pitch_rad, target, fruit, _place(task, fruit), near)
             except Refused as error:
                 why = reason_unless_halted(error)
@@ -174,7 +191,7 @@ async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit]) -> Pick:
 def _room_to(way: Approach, target: Target, near: Sequence[Target]) -> bool:
     """Whether the hand may go on, by what was seen of the neighbours on the way."""
     others = [Obstacle(centre=_point(other.p_base), radius_m=other.radius_m) for other in near]
-    return room_m(_point(target.p_base), way.pitch_rad, way.opening_m, others) >= ROOM_M_MIN
+    return room_m(_point(target.p_base), way.pitch_rad, way.opening_m, others, way.roll_rad) >= ROOM_M_MIN
 
 
 def _learn_neighbours(robot: Robot, look: Look, mine: Detection, target: Target, near: Sequence[Target], T: Array) -> None:
@@ -311,7 +328,7 @@ async def _take(task: Task, fruit: Fruit, way: Approach, target: Target) -> Pick
         if held:
             return await _carry(task, fruit, way, target, permit)
         why = "nothing was held: the force sensor felt no fruit"
-        await _go_along(robot, _reversed_way(target, way), PULL_SHARE, opening_for(target.radius_m))
+        await _go_along(robot, _reversed_way(target, way), PULL_SHARE, Grip(way.opening_m, way.roll_rad))
         try:
             lost = await servo(robot, way.pitch_rad, target, fruit, _place(task, fruit))
         except Refused as error:
@@ -333,8 +350,8 @@ def _reversed_way(target: Target, way: Approach) -> list[Joints]:
 
 async def _grasp(robot: Robot, way: Approach, target: Target) -> bool:
     """Advance straight onto the fruit and close; whether the force sensor feels it."""
-    opening_m = opening_for(target.radius_m)
-    await _go_along(robot, way_in(_point(target.p_base), way.pitch_rad, READY_M, 0.0), ADVANCE_SHARE, opening_m)
+    grip = Grip(way.opening_m, way.roll_rad)
+    await _go_along(robot, way_in(_point(target.p_base), way.pitch_rad, READY_M, 0.0), ADVANCE_SHARE, grip)
     await close_gripper(robot)
     force_n = robot.state().force_n
     if force_n is None:
@@ -390,7 +407,7 @@ async def _pull(robot: Robot, way: Approach, target: Target) -> str:
             path.append(_tilted(fruit, way.pitch_rad, share * RETREAT_M, tilt))
         except Refused:
             path.append(_tilted(fruit, way.pitch_rad, share * RETREAT_M, 0.0))
-    await _go_along(robot, path, PULL_SHARE, 0.0)
+    await _go_along(robot, path, PULL_SHARE, Grip(0.0, way.roll_rad))
     force_n = robot.state().force_n
     return f" (squeezed with {force_n:.1f} N)" if force_n is not None and force_n > GRIP_N_MAX else ""
 
@@ -401,27 +418,27 @@ def _tilted(fruit: Point3, pitch_rad: float, back_m: float, tilt_rad: float) -> 
     return inverse(along(fruit, pitch_rad, back_m), pitch_rad + tilt_rad)
 
 
-async def _go_along(robot: Robot, path: Sequence[Joints], share: float, opening_m: float) -> None:
-    """Run a path without stopping between its points; the gripper at `opening_m` all the while."""
+async def _go_along(robot: Robot, path: Sequence[Joints], share: float, grip: Grip) -> None:
+    """Run a path without stopping between its points; the fingers as told all the while."""
     robot.body.rest(False)
     now = joints_now(robot)
     for q in path:
         duration_s = max(0.08, leg_s(now, q, share, least_s=0.0))
         until_s = robot.clock.now() + duration_s
         while robot.clock.now() < until_s:
-            robot.body.want(arm=q, arm_s=duration_s, gripper_m=opening_m)
+            robot.body.want(arm=q, arm_s=duration_s, gripper_m=grip.opening_m, roll_rad=_roll(robot, grip))
             await robot.tick()
         now = q
     settled_s = robot.clock.now() + SETTLE_S
     while robot.clock.now() < settled_s:
-        robot.body.want(arm=now, arm_s=0.1, gripper_m=opening_m)
+        robot.body.want(arm=now, arm_s=0.1, gripper_m=grip.opening_m, roll_rad=_roll(robot, grip))
         await robot.tick()
 
 
-async def _swing(robot: Robot, goal: Joints, opening_m: float) -> None:
+async def _swing(robot: Robot, goal: Joints, grip: Grip) -> None:
     """To a pose by clear legs, the gripper opening on the way."""
     for leg in swing(joints_now(robot), goal):
-        await _go_along(robot, (leg.q,), FAST_SHARE, opening_m)
+        await _go_along(robot, (leg.q,), FAST_SHARE, grip)
 
 
 async def open_gripper(robot: Robot, opening_m: float = gardener.GRIPPER_OPEN_M) -> None:
@@ -434,7 +451,7 @@ async def open_gripper(robot: Robot, opening_m: float = gardener.GRIPPER_OPEN_M)
 async def to_basket(robot: Robot) -> None:
     """Over the basket without letting go, and open."""
     for leg in swing(joints_now(robot), BASKET_RAD):
-        await _go_along(robot, (leg.q,), FAST_SHARE, 0.0)
+        await _go_along(robot, (leg.q,), FAST_SHARE, Grip(0.0, 0.0))
     await open_gripper(robot)
 
 
