@@ -32,13 +32,13 @@ Ints: TypeAlias = NDArray[np.int32]
 
 WEIGHTS = "features.npz"
 VERSION = 2
-LONG_SIDE_PX = 432
+LONG_SIDE_PX = 400
 """Of the finest level of the pyramid."""
 RADIUS_PX = 6.0
 """Of the fruit that a level looks for, in its own pixels."""
 SCALES = 15
 SCALE_STEP = 1.19
-"""Each level is so many times smaller than the one before: fruit of 1.4 to 16 % of the image's longer side in radius."""
+"""Each level is so many times smaller than the one before: fruit of 1.5 to 17 % of the image's longer side in radius."""
 BORDER_PX = 22
 """Levels are continued by so much, that fruit at the image's edge are seen: at least offset + half a patch + mask."""
 PLANES = ("grey", "right", "down", "vivid", "edge")
@@ -58,7 +58,7 @@ BINS = 64
 """A feature's values -1..1 fall into so many; the stumps on it add up to a table over them."""
 DENSE = 8
 """The strongest features, computed at every pixel."""
-CANDIDATES_MAX = 200
+CANDIDATES_MAX = 60
 """A level."""
 APART = 0.8
 """Of the larger radius: nearer centres are one fruit."""
@@ -220,16 +220,9 @@ def planes_of(bgr: Floats) -> Floats:
     steepest channel's slope.
     """
     smooth = cv2.GaussianBlur(cv2.copyMakeBorder(bgr, *(BORDER_PX,) * 4, cv2.BORDER_REPLICATE), (3, 3), 0.7)
-    b, g, r = cv2.split(smooth)
     out = np.empty((len(PLANES), *smooth.shape[:2]), np.float32)
-    out[0] = (b + g + r) * np.float32(1 / 3)
-    out[1] = cv2.Sobel(out[0], cv2.CV_32F, 1, 0, scale=0.25)
-    out[2] = cv2.Sobel(out[0], cv2.CV_32F, 0, 1, scale=0.25)
-    out[3] = np.maximum(np.maximum(b, g), r) - np.minimum(np.minimum(b, g), r)
-    across = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.25)
-    along = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.25)
-    steep = cv2.split(across * across + along * along)
-    out[4] = np.sqrt(np.maximum(np.maximum(steep[0], steep[1]), steep[2]))
+    blue, green, red = (np.asarray(channel, np.float32) for channel in cv2.split(smooth))
+    kernels.slopes(blue, green, red, out)
     return out
 
 
@@ -238,10 +231,10 @@ def norms_of(planes: Floats, windows: frozenset[tuple[int, int]] = ALL_WINDOWS) 
     out = np.empty((len(planes), len(SIZES), *planes.shape[1:]), np.float32)
     squares = {plane: planes[plane] ** 2 for plane, _ in windows}
     for plane, which in windows:
-        box = (SIZES[which], SIZES[which])
-        mean = cv2.boxFilter(planes[plane], cv2.CV_32F, box)
-        variance = cv2.boxFilter(squares[plane], cv2.CV_32F, box) - mean * mean
-        np.divide(1 / SIZES[which], np.sqrt(np.maximum(variance, 0) + NOISE**2), out=out[plane, which])
+        size = SIZES[which]
+        mean = cv2.boxFilter(planes[plane], cv2.CV_32F, (size, size))
+        square = cv2.boxFilter(squares[plane], cv2.CV_32F, (size, size))
+        kernels.normalise(mean, square, size, NOISE, out[plane, which])
     return out
 
 

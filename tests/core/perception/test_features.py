@@ -73,7 +73,8 @@ def test_a_feature_says_the_same_at_a_point_as_in_its_map(level, which):
     one, patch = feature(2, which, 5, -3), patch_at(level, 2, which, 80, 60)
     votes = features.votes_of(level, one, patch)
     for x, y in ((60, 50), (100, 80)):
-        said = feature_kernels.vote(level.planes, level.weights, x, y, one, patch, features.mask())
+        lanes = np.zeros(feature_kernels.WIDE, np.float32)
+        said = feature_kernels.vote(level.planes, level.weights, x, y, one, patch, features.mask(), lanes)
         assert said == pytest.approx(votes[y - 3, x + 5], abs=1e-4)
 
 
