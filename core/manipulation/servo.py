@@ -20,10 +20,10 @@ GAIN = 0.7
 STEP_M_MAX = 0.06
 """No single step of the servo is longer."""
 PIXEL_SIGMA = 2.0
-RADIUS_SIGMA_RATIO = 0.12
+RADIUS_SIGMA_RATIO = 0.20
 """A fruit half hidden by a leaf looks smaller than it is, and fruit are not all of one size."""
-GATE_CHI2 = 16.3
-"""Chi-square with 3 degrees of freedom, 99.9 %."""
+GATE_CHI2 = 11.3
+"""Chi-square with 3 degrees of freedom, 99 %: neighbours hang two or three centimetres apart."""
 
 
 def interaction_matrix(
