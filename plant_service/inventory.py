@@ -112,7 +112,7 @@ class Fruits:
                 continue
             met.append(fruit)
             fruits.remove(fruit)
-            if pick.outcome != "picked":
+            if pick.outcome != "picked" and not pick.gone:
                 fruits.append(self._mark(fruit, pick, now_s))
         if met:
             self._replace(fruits)

@@ -16,7 +16,7 @@ from robot_service.eye import JPEG_COST_S, Look, drawn_jpeg
 from robot_service.robot import RANK_IDLE, Robot, SkillFailed, reason_of, tuple_of
 from robot_service.skills.dock import dock_at
 from robot_service.skills.drive import drive_to, undock
-from robot_service.skills.pick import KeepPicture, harvest
+from robot_service.skills.pick import KeepPicture, empty_hand, harvest
 from robot_service.skills.scan import scan
 from robot_service.skills.supply import charge, refill
 from robot_service.skills.water import Poured, water
@@ -86,6 +86,7 @@ class Planner:
         await dock_at(self.robot, self.docks, asked.plant.plant_id)
         self.robot.activity.job = "act"
         entry.progress = 0.4
+        await empty_hand(self.robot)
         scan_id = f"{asked.task_id}:{self.robot.settings.id}:{entry.epoch}"
         seen = await scan(self.robot, asked.plant, scan_id, asked.task_id)
         entry.progress = 0.9
@@ -105,6 +106,7 @@ class Planner:
         await dock_at(self.robot, self.docks, asked.plant.plant_id)
         self.robot.activity.job = "act"
         entry.progress = 0.3
+        await empty_hand(self.robot)
         wanted = asked.count or len(asked.fruits)
 
         async def leave(fruit_id: str) -> tuple[Permit, float]:

@@ -152,6 +152,8 @@ class Pick(Document):
     reason: Sentence = ""
     permit_id: Annotated[str, Field(max_length=80)] = ""
     """Empty when no permit was taken: nothing was touched."""
+    gone: bool = False
+    """Of one that failed: the fruit came off and fell; it hangs there no longer."""
     torn_green: Annotated[int, Field(ge=0, le=100)] = 0
     torn_other: Annotated[int, Field(ge=0, le=100)] = 0
     """Neighbours that came off with it, as far as the robot saw."""

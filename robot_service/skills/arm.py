@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from core.errors import Refused
-from core.manipulation.arm import Joints, nozzle_goal
+from core.manipulation.approach import RETREAT_M, along
+from core.manipulation.arm import Joints, hand_point, inverse, nozzle_goal
 from core.manipulation.swing import Leg, fold, leg_s, swing
 from core.robots import gardener
 from core.wire.body import BodyState
@@ -15,6 +17,9 @@ FIRST_FOLD_S = 2.0
 """An arm whose place nobody knows jumps at its first move; it goes to the folded pose."""
 SETTLE_S = 0.3
 LEG_LATE_S = 5.0
+IN_PLANT_M = 0.2
+"""A hand nearer to the stem than this is among leaves and fruit."""
+WITHDRAW_STEPS, WITHDRAW_SHARE = 3, 0.15
 NEAR_RAD = 0.03
 """The board tells its pulses to 10 us, which is half of this."""
 
@@ -60,11 +65,31 @@ async def fold_arm(robot: Robot) -> None:
     """Back over the body, as it must be before the base moves."""
     if is_folded(robot):
         return
+    await withdraw(robot)
     now = joints_now(robot)
     try:
         legs = fold(now) if robot.state().arm_rad is not None else (Leg(q=now, duration_s=FIRST_FOLD_S),)
     except Refused:
         legs = (Leg(q=gardener.ARM_HOME_RAD, duration_s=2 * leg_s(now, gardener.ARM_HOME_RAD)),)
+    await move_arm(robot, legs)
+
+
+async def withdraw(robot: Robot) -> None:
+    """Straight back out of the plant, as the hand came in: to swing aside among fruit would tear them off."""
+    if robot.state().arm_rad is None:
+        return
+    q = joints_now(robot)
+    tool, pitch_rad = hand_point(q), q[1] + q[2] + q[3]
+    if math.hypot(tool[0] - gardener.DOCK_TO_STEM_M, tool[1]) > IN_PLANT_M:
+        return
+    legs = []
+    for number in range(1, WITHDRAW_STEPS + 1):
+        try:
+            back = inverse(along(tool, pitch_rad, number * RETREAT_M / WITHDRAW_STEPS), pitch_rad)
+        except Refused:
+            break
+        legs.append(Leg(q=back, duration_s=leg_s(q, back, WITHDRAW_SHARE, least_s=0.1)))
+        q = back
     await move_arm(robot, legs)
 
 

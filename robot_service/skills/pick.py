@@ -36,7 +36,7 @@ from core.wire.fruit import Fruit, Pick
 from core.wire.market import Permit, PlantCard
 from robot_service.eye import Look
 from robot_service.robot import Robot, SkillFailed
-from robot_service.skills.arm import SETTLE_S, fold_arm, joints_now, move_arm
+from robot_service.skills.arm import SETTLE_S, fold_arm, joints_now, move_arm, withdraw
 from robot_service.skills.plantframe import mapped, plant_in_base
 
 WAYS_MAX = 3
@@ -45,9 +45,8 @@ LOOKS_MAX = 10
 """Of one servo run."""
 BLIND_MAX = 2
 """Pictures in a row without the fruit."""
-DOCKING_SIGMA_M = 0.012
+DOCKING_SIGMA_M = 0.006
 """The plant's frame is known this well from a dock: the robot's own pose error."""
-SIGMA_M_MIN = 0.008
 PLACES_MAX = 2
 """The dock, and once a little beside it."""
 SHIFT_MPS, SHIFT_RADPS, SHIFT_S, SHIFT_SHARE = 0.08, 0.15, 2.0, 0.7
@@ -223,7 +222,7 @@ def reason_unless_halted(error: Refused) -> str:
 
 
 def _expected(task: Task, fruit: Fruit) -> Target:
-    sigma_m = max(fruit.sigma_m, SIGMA_M_MIN) + DOCKING_SIGMA_M
+    sigma_m = math.hypot(fruit.sigma_m, DOCKING_SIGMA_M)
     return Target.expected(np.array(_place(task, fruit)), sigma_m, fruit.radius_m)
 
 
@@ -313,6 +312,8 @@ async def _take(task: Task, fruit: Fruit, way: Approach, target: Target) -> Pick
     """The irreversible part: under a permit, and nothing of it is begun after the permit's validity."""
     robot = task.robot
     before = await robot.eye.look()
+    if feels(robot):
+        raise SkillFailed(f"the force sensor feels {robot.state().force_n:.1f} N between open fingers: it is stuck")
     permit, asked_s = await task.take_permit(fruit.fruit_id)
     await task.keep_picture(permit, "before", before)
     why = ""
@@ -374,22 +375,21 @@ async def _carry(task: Task, fruit: Fruit, way: Approach, target: Target, permit
     feared = await _pull(robot, way, target)
     after = await robot.eye.look()
     await task.keep_picture(permit, "after", after)
-    force_n = robot.state().force_n
-    held = force_n is not None and force_n > HELD_N
+    held = feels(robot)
     T_base_cam = camera_pose(joints_now(robot))
     still = best_match(robot, after.detections, _sharp(target), T_base_cam, fruit.colour)
     if not held:
         where = "it still hangs there" if still is not None else "it fell"
         await open_gripper(robot, way.opening_m)
-        return Pick(
-            fruit_id=fruit.fruit_id,
-            outcome="failed",
-            reason=f"slipped out of the fingers{feared}: {where}",
-            permit_id=permit.permit_id,
-        )
-    await to_basket(robot)
+        return _lost(fruit, permit, f"slipped out of the fingers{feared}: {where}", gone=still is None)
+    if not await to_basket(robot):
+        return _lost(fruit, permit, "slipped out of the fingers on the way to the basket: it fell", gone=still is None)
     remark = "held by force; another fruit shows where it hung" if still is not None else ""
     return Pick(fruit_id=fruit.fruit_id, outcome="picked", reason=remark, permit_id=permit.permit_id)
+
+
+def _lost(fruit: Fruit, permit: Permit, reason: str, gone: bool) -> Pick:
+    return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason=reason, permit_id=permit.permit_id, gone=gone)
 
 
 def _sharp(target: Target) -> Target:
@@ -448,14 +448,34 @@ async def open_gripper(robot: Robot, opening_m: float = gardener.GRIPPER_OPEN_M)
         await robot.tick()
 
 
-async def to_basket(robot: Robot) -> None:
-    """Over the basket without letting go, and open."""
+async def to_basket(robot: Robot) -> bool:
+    """Over the basket without letting go, and open; whether something was held until there."""
     for leg in swing(joints_now(robot), BASKET_RAD):
         await _go_along(robot, (leg.q,), FAST_SHARE, Grip(0.0, 0.0))
+    held = feels(robot)
     await open_gripper(robot)
+    return held
+
+
+def feels(robot: Robot) -> bool:
+    """Whether the force sensor feels something between the fingers."""
+    force_n = robot.state().force_n
+    return force_n is not None and force_n > HELD_N
+
+
+async def empty_hand(robot: Robot) -> None:
+    """What a brain before this one left in the hand goes into the basket. Raises SkillFailed when the hand stays full."""
+    if not feels(robot):
+        return
+    robot.note("pick", "something is in the hand from before: it goes into the basket")
+    await withdraw(robot)
+    await to_basket(robot)
+    await fold_arm(robot)
+    if feels(robot):
+        raise SkillFailed(f"the force sensor feels {robot.state().force_n:.1f} N between open fingers: it is stuck")
 
 
 BASKET_RAD: Joints = gardener.ARM_BASKET_RAD
 """The tool over the basket, pointing down."""
 
-__all__ = ["LOOK_M", "Task", "close_gripper", "harvest", "open_gripper", "servo", "to_basket"]
+__all__ = ["LOOK_M", "Task", "close_gripper", "empty_hand", "harvest", "open_gripper", "servo", "to_basket"]
