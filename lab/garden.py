@@ -21,12 +21,14 @@ from urllib.parse import urlsplit
 import httpx
 
 from console.processes import Place, Process, enrolled, processes
+from console.service import build as build_console
 from core.clock import Clock, VirtualClock
 from core.errors import LinkDown
 from core.mesh.auth import Identity, Verifier, make_garden
+from core.mesh.client import HttpxTransport
 from core.mesh.node import Node
 from core.mesh.peers import Peers
-from core.mesh.runtime import GardenSettings
+from core.mesh.runtime import GardenSettings, Runtime
 from core.scenario import Scenario, device_ports
 from hw.links import ByteLink, MemoryLink, MemoryNet
 from lab.mesh import MemoryMesh, MemoryTransport
@@ -153,6 +155,18 @@ class Garden:
         self.running[name] = running
         running.task = asyncio.create_task(self._live(running), name=name)
         running.task.add_done_callback(self._watch)
+
+    async def open_console(self) -> None:
+        """Have the operator's console answer too."""
+        running = Running(self._processes["console"], self.mesh.transport("console"))
+        with _environment(self._env("console")):
+            common = GardenSettings()
+        assert common.keys is not None
+        identity, verifier = Identity.load(common.keys), Verifier.load(common.keys)
+        runtime = Runtime(common, self.clock, (), identity, verifier, Peers(common.peers), HttpxTransport(running.transport))
+        running.node = await build_console(runtime)
+        self.mesh.attach("console", f"127.0.0.1:{running.process.port}", running.node.app)
+        self.running["console"] = running
 
     async def kill(self, name: str) -> None:
         """SIGKILL: from this instant nothing the process does reaches anybody, and its data stays as it lies on disk."""
