@@ -60,6 +60,8 @@ DENSE = 8
 """The strongest features, computed at every pixel."""
 CANDIDATES_MAX = 60
 """A level."""
+VOTES_SOFT = 1.5
+"""Margins of pictured vote maps, in these steps, go through a logistic function."""
 APART = 0.8
 """Of the larger radius: nearer centres are one fruit."""
 
@@ -170,7 +172,7 @@ def found(image: Image, model: Model) -> tuple[Floats, Floats]:
 
 
 def stages(image: Image) -> dict[str, Image | Floats]:
-    """What `garden see --stages` shows: the planes and the vote map (0..1: the chance of a fruit) of every third level."""
+    """What `garden see --stages` shows: the planes and the vote map of every third level (0..1, softened)."""
     model = packaged()
     pictures: dict[str, Image | Floats] = {}
     for k, level in enumerate(levels(image, model.windows)):
@@ -179,10 +181,10 @@ def stages(image: Image) -> dict[str, Image | Floats]:
             pictures |= {name: _stretched(plane[inner]) for name, plane in zip(PLANES, level.planes, strict=True)}
         if k % 3 == 0:
             votes = vote_map(level, model, len(model.features))[inner]
-            chance = np.asarray(1 / (1 + np.exp(-(model.slope[0] + model.slope[1] * votes))), np.float32)
+            soft = np.asarray(1 / (1 + np.exp(-votes / VOTES_SOFT)), np.float32)
             size = (round(level.shape[1] * level.zoom), round(level.shape[0] * level.zoom))
             name = f"votes_radius_{RADIUS_PX * level.zoom:.0f}px"
-            pictures[name] = np.asarray(cv2.resize(chance, size, interpolation=cv2.INTER_NEAREST), np.float32)
+            pictures[name] = np.asarray(cv2.resize(soft, size, interpolation=cv2.INTER_NEAREST), np.float32)
     return pictures
 
 
