@@ -41,7 +41,7 @@ SPRING_DAMPING = 60.0
 WHEEL_TRAVEL_M = 0.016
 TYRE_PRESS_M = 0.0006
 """Half of what a loaded tyre gives way: added to its radius, so that it rolls on the nominal one."""
-WHEEL_KV = 4.0
+WHEEL_KV = 2.0
 """Of the motor's speed loop [N m s/rad]: tight, as the Create's own is."""
 WHEEL_TORQUE_NM_MAX = 0.5
 
@@ -110,7 +110,12 @@ def _wheels(spec: Any, base: Any, robot: Robot, traits: Traits) -> None:
             name=f"{name}-spring", type=SLIDE, axis=[0, 0, -1], range=[-0.010, WHEEL_TRAVEL_M], limited=True,
             stiffness=SPRING_NPM, springref=WHEEL_LOAD_N / SPRING_NPM, damping=SPRING_DAMPING,
         )  # fmt: skip
-        wheel.add_joint(name=f"{name}-wheel", type=HINGE, axis=[0, 1, 0], damping=0.002, armature=0.002)
+        # The limit stands at the joint: a motor that is cut off itself is integrated explicitly, and its loop then flips a
+        # standing wheel to and fro at every step for ever, so that the world never rests.
+        wheel.add_joint(
+            name=f"{name}-wheel", type=HINGE, axis=[0, 1, 0], damping=0.002, armature=0.002,
+            actfrclimited=True, actfrcrange=[-WHEEL_TORQUE_NM_MAX, WHEEL_TORQUE_NM_MAX],
+        )  # fmt: skip
         wheel.add_geom(
             name=f"{name}-tread", type=SPHERE, size=[r_m + TYRE_PRESS_M, 0, 0], mass=WHEEL_KG, group=HULL_GROUP, **NOTHING
         )
@@ -118,7 +123,6 @@ def _wheels(spec: Any, base: Any, robot: Robot, traits: Traits) -> None:
                        rgba=DARK, mass=0.0, group=VISUAL_GROUP, **NOTHING)  # fmt: skip
         motor = spec.add_actuator(name=f"{name}-motor", target=f"{name}-wheel", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_velocity(WHEEL_KV)
-        motor.forcelimited, motor.forcerange = True, [-WHEEL_TORQUE_NM_MAX, WHEEL_TORQUE_NM_MAX]
 
 
 def _casters(spec: Any, base: Any, name: str) -> None:

@@ -156,3 +156,12 @@ def test_the_older_create_drives_on_its_own_wheels(world: World) -> None:
     left, right = robot.drive.travel_m()
     believed = (right - left) / g.WHEELBASE_M["create1"]
     assert 0.88 < robot.pose.yaw_rad / believed < 0.97
+
+
+@pytest.mark.parametrize("kick_radps", [0.35, 3.0])
+def test_a_wheel_that_was_kicked_comes_to_rest(world: World, kick_radps: float) -> None:
+    world.advance(1.0)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        world.data.qvel[world.model.joint(f"robot-1/{side}-wheel").dofadr[0]] = sign * kick_radps
+    world.advance(2.0)
+    assert world.at_rest
