@@ -61,8 +61,8 @@ def test_after_a_brain_died_under_a_permit_a_scan_comes_before_anything_is_picke
 @pytest.mark.parametrize(
     ("way", "for_s"),
     [
-        pytest.param((ROBOT, PLANT), 6.0, id="reports late", marks=pytest.mark.soak),
-        pytest.param((ROBOT, PLANT), 150.0, id="reports lost"),
+        pytest.param((ROBOT, PLANT), 6.0, id="reports late"),
+        pytest.param((ROBOT, PLANT), 150.0, id="reports lost", marks=pytest.mark.soak),
         pytest.param((PLANT, ROBOT), 150.0, id="answers lost", marks=pytest.mark.soak),
     ],
 )
