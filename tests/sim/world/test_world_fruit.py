@@ -216,7 +216,8 @@ def test_an_emptied_basket_is_told_and_the_place_flowers_again(world: World) -> 
     assert fruit_id not in {fruit.id for fruit in plant.fruit}
     assert (fruit_id, "taken", ROBOT, "red") in {(gone.id, gone.how, gone.robot_id, gone.colour) for gone in plant.gone}
     assert all(fruit.where != "basket" for fruit in plant.fruit)
-    world.advance(0.5)
+    # A neighbour that fell on the way rolls for a while.
+    world.advance(4.0)
     assert world.at_rest
     assert spot.hangs
     assert not spot.there
