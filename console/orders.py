@@ -17,6 +17,8 @@ from core.wire.market import FINAL_STATES, Task, TaskRequest
 from core.wire.order import Order, OrderPart, OrderRequest, OrderState
 
 RIPE_CONFIDENCE_MIN = 0.6
+SIGMA_M_MAX = 0.03
+"""A hand finds no fruit that is known less well than this: one view alone saw it, and often it is none."""
 PER_TASK_MAX = 64
 Send = Callable[[Peer, TaskRequest], Awaitable[Task]]
 """Posts a task at a pot with the right token."""
@@ -67,7 +69,8 @@ def _stock(inventory: Inventory | GardenError, hope: Forecast | GardenError, tas
 
 
 def _may_be_picked(fruit: Fruit) -> bool:
-    return fruit.confidence >= RIPE_CONFIDENCE_MIN and not (fruit.unreachable or fruit.failed or fruit.in_doubt)
+    sure = fruit.confidence >= RIPE_CONFIDENCE_MIN and fruit.sigma_m <= SIGMA_M_MAX
+    return sure and not (fruit.unreachable or fruit.failed or fruit.in_doubt)
 
 
 def _stands(task: Task) -> bool:

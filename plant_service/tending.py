@@ -26,6 +26,8 @@ from plant_service.market import Marketplace
 from plant_service.shelf import Shelf
 
 RIPE_CONFIDENCE_MIN = 0.6
+SIGMA_M_MAX = 0.03
+"""A hand finds no fruit that is known less well than this: one view alone saw it, and often it is none."""
 KEEP_RIPE, KEEP_RIPE_S = 2, 6 * 3600.0
 """So many ripe fruit are left for people who order some, for so long: a pot asks for all others to be picked at once."""
 LOOK_AGAIN_S = 2 * 3600.0
@@ -235,4 +237,5 @@ class Tending:
 
 
 def _may_be_picked(fruit: Fruit) -> bool:
-    return fruit.confidence >= RIPE_CONFIDENCE_MIN and not (fruit.unreachable or fruit.failed or fruit.in_doubt)
+    sure = fruit.confidence >= RIPE_CONFIDENCE_MIN and fruit.sigma_m <= SIGMA_M_MAX
+    return sure and not (fruit.unreachable or fruit.failed or fruit.in_doubt)
