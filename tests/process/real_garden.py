@@ -62,6 +62,10 @@ class Watched:
     def post(self, name: str, path: str, body: dict[str, Any]) -> httpx.Response:
         return self._http.post(self._url(name) + path, json=body)
 
+    def picture(self, robot: str) -> httpx.Response:
+        """What its hand sees, fruit ringed."""
+        return self._http.get(self._url(robot) + "/camera.jpg", timeout=20.0).raise_for_status()
+
     def _url(self, name: str) -> str:
         return f"http://127.0.0.1:{self.listed[name].port}"
 
