@@ -263,3 +263,20 @@ def test_two_hundred_fruit_are_told_apart() -> None:
     plant.scan()
     assert len(plant.tracks) == 200
     assert all(track.fruit.confidence > FLOOR for track in plant.tracks)
+
+
+def test_a_fruit_that_one_of_six_views_shows_counts_once_it_is_seen_again():
+    lone = Tomato((0.05, 0.0, 0.2), hidden=frozenset(range(1, 6)))
+    plant = Plant([lone], random.Random(5))
+    plant.scan()
+    assert plant.of(lone).fruit.confidence < 0.5
+    plant.now_s += 3600.0
+    plant.scan()
+    assert plant.of(lone).fruit.confidence >= 0.5
+
+
+def test_a_fruit_that_two_views_show_counts_at_once():
+    shown = Tomato((0.05, 0.0, 0.2), hidden=frozenset(range(2, 6)))
+    plant = Plant([shown], random.Random(5))
+    plant.scan()
+    assert plant.of(shown).fruit.confidence > 0.8
