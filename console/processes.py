@@ -133,6 +133,8 @@ class _Maker:
             "PLANT_TARGET_RATIO": f"{plant.target_ratio:g}",
             "PLANT_DOSE_ML": f"{plant.dose_ml:g}",
         }
+        env |= {"PLANT_INVENTORY": "false"} if not plant.inventory else {}
+        env |= {"PLANT_HARVEST": "false"} if not plant.harvest else {}
         return self._process(plant.id, "plant", "plant_service", env, ("sim",))
 
     def station(self) -> Process:

@@ -63,6 +63,10 @@ class Plant(_Section):
     soil_litres: Annotated[float, Field(gt=0.5, le=50)] = 3.0
     height_m: Annotated[float, Field(ge=0.3, le=1.5)] = 0.9
     fruit: Annotated[int, Field(ge=0, le=60)] = 12
+    inventory: bool = True
+    """Whether the pot asks for scans of its fruit by itself."""
+    harvest: bool = True
+    """Whether it asks for ripe fruit to be picked by itself."""
 
     @property
     def dock(self) -> Pose2:

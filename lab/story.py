@@ -65,6 +65,12 @@ def one_pot(**changes: Any) -> Scenario:
     return garden_of(("plant-1",), robots=(near_robot(**changes),))
 
 
+def water_only(scenario: Scenario) -> Scenario:
+    """The same garden, its pots asking for nothing but water."""
+    plants = tuple(plant.model_copy(update={"inventory": False, "harvest": False}) for plant in scenario.plants)
+    return scenario.model_copy(update={"plants": plants})
+
+
 @asynccontextmanager
 async def growing(scenario: Scenario, seed: int | None = None, **more: Any) -> AsyncIterator[Garden]:
     """The garden in a folder of its own, with a short soak, its pots asking for water only.

@@ -155,6 +155,8 @@ class Clockwork:
             self._due_s = -math.inf
             self._anchor()
             return
+        if self._due_s == -math.inf:
+            self._serve_hosts()
         resting = self._world.at_rest
         step_s = self._stride_s() if resting else TICK_S
         self._until_s = self._world.time_s + step_s
@@ -179,6 +181,10 @@ class Clockwork:
             self.strides += 1
         else:
             self.ticks += 1
+        self._serve_hosts()
+
+    def _serve_hosts(self) -> None:
+        """Let every host run that is due; when the next one will be."""
         self._due_s = min([self._pumped(host, self._world.time_s) for host in self._hosts], default=math.inf)
 
     def _pumped(self, host: Host, now_s: float) -> float:

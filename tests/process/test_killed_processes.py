@@ -47,7 +47,7 @@ def pumps(garden: RealGarden) -> bool:
 
 
 def test_a_brain_that_hangs_stops_its_wheels_and_a_killed_pot_keeps_its_word(tmp_path):
-    scenario = story.garden_of(("plant-1",), ("plant-3",), (story.near_robot(),))
+    scenario = story.water_only(story.garden_of(("plant-1",), ("plant-3",), (story.near_robot(),)))
     with RealGarden(tmp_path / "g", scenario, FAST) as garden:
         garden.start("sim", "plant-1", "plant-3", "robot-1-body", "robot-1")
         garden.until(lambda: drives(garden), 60.0)
@@ -69,7 +69,7 @@ def test_a_brain_that_hangs_stops_its_wheels_and_a_killed_pot_keeps_its_word(tmp
 
 
 def test_a_brain_killed_while_it_drives_docks_or_pumps_stops_and_the_pot_gets_one_dose(tmp_path):
-    with RealGarden(tmp_path / "g", story.one_pot(), FAST, SOAK) as garden:
+    with RealGarden(tmp_path / "g", story.water_only(story.one_pot()), FAST, SOAK) as garden:
         garden.start("sim", "plant-1", "robot-1-body", "robot-1")
         for soon, moment in ((drives, drives), (docks, seeks), (pumps, pumps)):
             garden.until(lambda soon=soon: soon(garden), 120.0)
@@ -94,7 +94,7 @@ def test_a_brain_killed_while_it_drives_docks_or_pumps_stops_and_the_pot_gets_on
 def test_a_killed_world_comes_back_both_pots_are_served_and_all_ends_on_sigint(tmp_path):
     robots = (story.near_robot(), story.near_robot(id="robot-2", x_m=1.60, y_m=-0.42, yaw_deg=-90.0))
     pots = ("plant-1", "plant-4")
-    with UpGarden(tmp_path / "g", story.garden_of(pots, robots=robots), FAST) as garden:
+    with UpGarden(tmp_path / "g", story.water_only(story.garden_of(pots, robots=robots)), FAST) as garden:
         garden.ready(90.0)
         assert len(garden.pids()) == len(garden.listed) + 1
         garden.until(lambda: pumps(garden), 120.0)
