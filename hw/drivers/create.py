@@ -27,6 +27,8 @@ SILENCE_RESTING_S = 3.5
 LULL_S = 9.0
 """After a long rest it is left alone for so long between polls."""
 SETTLE_S = 0.05
+BAUD = {Model.CREATE1: 57600, Model.CREATE2: 115200}
+BAUD_SETTLE_S = 0.1
 """Between mode changes at connection; the manual asks for 20 ms."""
 REFRESH_S = 0.25
 """An unchanged setpoint goes over the wire this often, in case noise ate it."""
@@ -87,6 +89,8 @@ class CreateDriver(Session):
         self._mode: Mode | None = None
         """What the base was last told to be; None before the connection's first Start."""
         self._mode_sent_s = -math.inf
+        self._again = False
+        """Whether this is not the first connection."""
         self._seeking = False
         self._rims = (0, 0)
         """Right and left setpoint on the wire [mm/s]."""
@@ -210,6 +214,11 @@ class CreateDriver(Session):
 
     async def _converse(self) -> None:
         self._send(FLUSH + wire.bare(Op.START))
+        if self._again:
+            # Noise can say "another baud rate": a base that went silent is told its own again.
+            self._send(wire.baud(BAUD[self._model]))
+            await self._clock.sleep(BAUD_SETTLE_S)
+        self._again = True
         await self._clock.sleep(SETTLE_S)
         self._send(wire.drive_direct(0, 0) + wire.bare(Op.START))
         self._mode, self._mode_sent_s = Mode.PASSIVE, self._clock.now()

@@ -99,7 +99,8 @@ class Ssc32Driver(Session):
         self._outputs.add(channel)
         if not high:
             self._high.discard(channel)
-            self._send(wire.encode_outputs({channel: False}))
+            # Said twice: what a flipped bit makes of one, the other sets right at once.
+            self._send(2 * wire.encode_outputs({channel: False}))
         elif self._identified and self._send(wire.encode_outputs({channel: True})):
             self._high.add(channel)
             self._wake.fire()
