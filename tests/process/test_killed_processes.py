@@ -42,8 +42,9 @@ def seeks(garden: RealGarden) -> bool:
 
 
 def pumps(garden: RealGarden) -> bool:
+    """Well into the dose: so much arrived that the pot can see it, and a broken dose counts as given."""
     truth = garden.robot()
-    return truth.pumping and truth.pumped_ml > 0.2 * story.DOSE_ML
+    return truth.pumping and truth.pumped_ml > 0.35 * story.DOSE_ML
 
 
 def test_a_brain_that_hangs_stops_its_wheels_and_a_killed_pot_keeps_its_word(tmp_path):
@@ -83,8 +84,12 @@ def test_a_brain_killed_while_it_drives_docks_or_pumps_stops_and_the_pot_gets_on
         begun_ml = garden.poured_ml("plant-1")
         garden.run_at(RESTING)
         task = garden.served("plant-1", 90.0)
-        assert garden.poured_ml("plant-1") == begun_ml <= 0.5 * story.DOSE_ML
+        assert begun_ml <= 0.5 * story.DOSE_ML
         assert task["permits"] == 1
+        # Still dry, the pot may have asked again meanwhile; beyond the broken dose comes only what the new task permits.
+        poured_ml = garden.poured_ml("plant-1")
+        later_ml = sum(story.allowed_ml(later) for later in garden.get("plant-1", "/tasks")[1:])
+        assert poured_ml == begun_ml or poured_ml <= begun_ml + later_ml
         garden.until(lambda: len(garden.get("plant-1", "/tasks")) > 1, 60.0)
         assert garden.get("plant-1", "/tasks")[1]["asked_by"] == "soil"
         garden.unhurt()
