@@ -115,7 +115,7 @@ def _residual(camera: Camera, T: Array, circle: Detection, x: Array, *, robust: 
     J[2, 3] = fx / z
     side = BEARING_SIGMA_PX + BEARING_SIGMA_RATIO * circle.radius_px
     size = 1.0 + SIZE_SIGMA_RATIO * circle.radius_px
-    gap = np.array([circle.u_px, circle.v_px, circle.radius_px]) - expected
+    gap = circle.features - expected
     sigmas = np.array([side, side, size])
     weights = sigmas**-2
     if robust:

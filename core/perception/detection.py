@@ -30,6 +30,11 @@ class Detection:
     colour: Colour
     confidence: float
 
+    @property
+    def features(self) -> NDArray[np.float64]:
+        """The circle as (u, v, r) [px]."""
+        return np.array([self.u_px, self.v_px, self.radius_px])
+
 
 Detector = Callable[[Image], list[Detection]]
 

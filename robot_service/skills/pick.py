@@ -14,13 +14,13 @@ import numpy as np
 
 from core.errors import Refused, Unprocessable
 from core.manipulation.approach import (
-    LOOK_M,
     READY_M,
     RETREAT_M,
     ROLLS_RAD,
     ROOM_M_MIN,
     Approach,
     Obstacle,
+    along,
     approaches,
     room_m,
     way_in,
@@ -59,7 +59,6 @@ HELD_N = 0.8
 """Squeeze above which something is between the fingers."""
 GRIP_N_MAX = 9.0
 CLOSE_S = 0.6
-CLOSE_TICK_M = 0.004
 GRASPS_MAX = 2
 FAST_SHARE, ADVANCE_SHARE, PULL_SHARE = 0.5, 0.2, 0.15
 """Of a servo's top speed: through the air, in among the fruit, and with one in hand."""
@@ -111,12 +110,7 @@ async def harvest(
     known: Sequence[Fruit] = (),
 ) -> None:
     """Pick up to `count` of `fruits`, those with the most room first. `ended` hears of each as soon as it is over."""
-    task = Task(
-        robot=robot,
-        plant=plant,
-        take_permit=take_permit,
-        keep_picture=keep_picture,
-    )
+    task = Task(robot=robot, plant=plant, take_permit=take_permit, keep_picture=keep_picture)
     left = list(fruits)
     hanging = {fruit.fruit_id: fruit for fruit in (*known, *fruits)}
     picked = 0
@@ -204,12 +198,12 @@ def _learn_neighbours(robot: Robot, look: Look, mine: Detection, target: Target,
         if distance2 < GATE_CHI2:
             circle = free.pop(index)
             other.p_base = guess.p_base
-            other.see(robot.eye.camera, T, np.array([circle.u_px, circle.v_px, circle.radius_px]))
+            other.see(robot.eye.camera, T, circle.features)
 
 
 def _distance2(robot: Robot, target: Target, circle: Detection, T: Array) -> float:
     try:
-        return target.distance2(robot.eye.camera, T, np.array([circle.u_px, circle.v_px, circle.radius_px]))
+        return target.distance2(robot.eye.camera, T, circle.features)
     except Unprocessable:
         return math.inf
 
@@ -259,7 +253,7 @@ async def servo(
                 return "the camera does not see it"
             continue
         blind = 0
-        target.see(robot.eye.camera, T_base_cam, np.array([circle.u_px, circle.v_px, circle.radius_px]))
+        target.see(robot.eye.camera, T_base_cam, circle.features)
         _learn_neighbours(robot, look, circle, target, near, T_base_cam)
         if float(np.linalg.norm(target.p_base - np.array(place))) > FAR_OFF_M + FAR_OFF_SIGMAS * fruit.sigma_m:
             return "what the camera sees hangs too far from where the inventory has the fruit"
@@ -284,18 +278,14 @@ async def _step(robot: Robot, pitch_rad: float, target: Target, T_base_cam: Arra
     """One step of the control law."""
     camera = robot.eye.camera
     u, v, r = target.features(camera, T_base_cam)
-    goal = replace_target(target, T_base_cam).features(camera, T_base_cam)
+    at_goal = replace(target, p_base=T_base_cam[:3, :3] @ GOAL_IN_CAMERA_M + T_base_cam[:3, 3])
+    goal = at_goal.features(camera, T_base_cam)
     L = interaction_matrix(camera, u, v, r, target.radius_m)
     step = T_base_cam[:3, :3] @ servo_step(L, np.array([u, v, r]) - goal)
     at = T_base_cam[:3, 3] + step
     q = inverse((float(at[0]), float(at[1]), float(at[2])), pitch_rad, gardener.CAMERA_IN_HAND_M)
     now = joints_now(robot)
     await move_arm(robot, [Leg(q=q, duration_s=leg_s(now, q, FAST_SHARE))])
-
-
-def replace_target(target: Target, T_base_cam: Array) -> Target:
-    """The same fruit where the servo wants to have it in the picture."""
-    return Target(p_base=T_base_cam[:3, :3] @ GOAL_IN_CAMERA_M + T_base_cam[:3, 3], P=target.P, radius_m=target.radius_m)
 
 
 def best_match(
@@ -362,10 +352,18 @@ async def _grasp(robot: Robot, way: Approach, target: Target) -> bool:
 
 async def close_gripper(robot: Robot) -> None:
     """Close until the force sensor feels something firmly, or the fingers meet."""
-    until_s = robot.clock.now() + CLOSE_S + SETTLE_S
-    q = joints_now(robot)
+    await _fingers(robot, 0.0, CLOSE_S + SETTLE_S)
+
+
+async def open_gripper(robot: Robot, opening_m: float = gardener.GRIPPER_OPEN_M) -> None:
+    await _fingers(robot, opening_m, RELEASE_S)
+
+
+async def _fingers(robot: Robot, opening_m: float, seconds: float) -> None:
+    """Move the fingers while the arm holds still."""
+    q, until_s = joints_now(robot), robot.clock.now() + seconds
     while robot.clock.now() < until_s:
-        robot.body.want(arm=q, arm_s=0.1, gripper_m=0.0)
+        robot.body.want(arm=q, arm_s=0.1, gripper_m=opening_m)
         await robot.tick()
 
 
@@ -413,8 +411,6 @@ async def _pull(robot: Robot, way: Approach, target: Target) -> str:
 
 
 def _tilted(fruit: Point3, pitch_rad: float, back_m: float, tilt_rad: float) -> Joints:
-    from core.manipulation.approach import along
-
     return inverse(along(fruit, pitch_rad, back_m), pitch_rad + tilt_rad)
 
 
@@ -441,16 +437,9 @@ async def _swing(robot: Robot, goal: Joints, grip: Grip) -> None:
         await _go_along(robot, (leg.q,), FAST_SHARE, grip)
 
 
-async def open_gripper(robot: Robot, opening_m: float = gardener.GRIPPER_OPEN_M) -> None:
-    q, until_s = joints_now(robot), robot.clock.now() + RELEASE_S
-    while robot.clock.now() < until_s:
-        robot.body.want(arm=q, arm_s=0.1, gripper_m=opening_m)
-        await robot.tick()
-
-
 async def to_basket(robot: Robot) -> bool:
     """Over the basket without letting go, and open; whether something was held until there."""
-    for leg in swing(joints_now(robot), BASKET_RAD):
+    for leg in swing(joints_now(robot), gardener.ARM_BASKET_RAD):
         await _go_along(robot, (leg.q,), FAST_SHARE, Grip(0.0, 0.0))
     held = feels(robot)
     await open_gripper(robot)
@@ -473,9 +462,3 @@ async def empty_hand(robot: Robot) -> None:
     await fold_arm(robot)
     if feels(robot):
         raise SkillFailed(f"the force sensor feels {robot.state().force_n:.1f} N between open fingers: it is stuck")
-
-
-BASKET_RAD: Joints = gardener.ARM_BASKET_RAD
-"""The tool over the basket, pointing down."""
-
-__all__ = ["LOOK_M", "Task", "close_gripper", "empty_hand", "harvest", "open_gripper", "servo", "to_basket"]
