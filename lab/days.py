@@ -18,12 +18,10 @@ from core.virtual import run_virtual
 from core.wire.geometry import Pose2
 from lab import stand_in
 from lab.garden import Garden
-from lab.orchard import MOIST_RATIO, ROBOT, START, matched, reachable, visible
+from lab.orchard import COUNTED_CONFIDENCE, MOIST_RATIO, ROBOT, START, matched, reachable, visible
 from lab.quiet import hush
 from sim.truth import FruitTruth
 
-COUNTED_CONFIDENCE = 0.5
-"""A fruit that the plant believes in less is not counted."""
 BUSY_S, REST_S = 1.0, 5.0
 """How often a busy and a resting garden is looked at."""
 LOOK_S = 600.0

@@ -16,12 +16,10 @@ from core.virtual import run_virtual
 from core.wire.market import FINAL_STATES
 from lab import story
 from lab.garden import Garden
-from lab.orchard import MOIST_RATIO, PLANT, SAME_FRUIT_M, START, in_base, matched
+from lab.orchard import COUNTED_CONFIDENCE, MOIST_RATIO, PLANT, SAME_FRUIT_M, START, in_base, matched
 from lab.quiet import hush
 from sim.truth import FruitTruth
 
-QUIET = {"PLANT_INVENTORY": "false", "PLANT_HARVEST": "false"}
-"""Of a pot that asks for nothing by itself but for a scan when a pick is in doubt."""
 TOLD_SIGMA_M = 0.006
 PEEK_S = 0.1
 
@@ -58,8 +56,8 @@ class Orchard:
 Story = Callable[[Orchard], Awaitable[None]]
 
 
-def tell(scenario: Scenario, told: Story, seed: int, pots: Mapping[str, str] = QUIET) -> None:
-    """Play a story of fruit on virtual time. `pots`: settings of every pot."""
+def tell(scenario: Scenario, told: Story, seed: int, pots: Mapping[str, str] = story.WATER_ONLY) -> None:
+    """Play a story of fruit on virtual time. `pots`: settings of every pot; else it scans only when in doubt."""
     hush()
     print(f"seed {seed}")
 
@@ -190,7 +188,7 @@ async def ledger(orchard: Orchard, plant_id: str = PLANT) -> list[dict[str, Any]
 async def known(orchard: Orchard, plant_id: str = PLANT) -> list[dict[str, Any]]:
     """The pot's fruit that count."""
     inventory = await orchard.garden.get(plant_id, "/inventory")
-    return [fruit for fruit in inventory["fruits"] if fruit["confidence"] >= 0.5]
+    return [fruit for fruit in inventory["fruits"] if fruit["confidence"] >= COUNTED_CONFIDENCE]
 
 
 async def tried(orchard: Orchard, plant_id: str = PLANT) -> set[str]:

@@ -27,6 +27,8 @@ FRUIT = 18
 VISIBLE_RATIO_MIN = 0.4
 """A fruit that shows less of its disc does not count as visible (DESIGN, section 8)."""
 SAME_FRUIT_M = 0.03
+COUNTED_CONFIDENCE = 0.5
+"""A fruit that the plant believes in less is not counted."""
 MOIST_RATIO = 0.35
 START = {"x_m": -1.60, "y_m": 0.42, "yaw_deg": 90.0}
 

@@ -22,6 +22,7 @@ from lab.garden import Garden
 from lab.orchard import PLANT, ROBOT, hanging, matched, one_plant, reachable
 from lab.quiet import hush
 from lab.results import Result, held
+from lab.story import WATER_ONLY
 
 TRIALS = 100
 """Reachable red fruit to be tried, at least."""
@@ -65,7 +66,7 @@ def trial(seed: int, detector: str) -> Trial:
 
 
 async def _trial(seed: int, detector: str, folder: Path) -> Trial:
-    settings = {ROBOT: {"ROBOT_DETECTOR": detector}, PLANT: {"PLANT_HARVEST": "false", "PLANT_INVENTORY": "false"}}
+    settings = {ROBOT: {"ROBOT_DETECTOR": detector}, PLANT: WATER_ONLY}
     async with Garden(one_plant(FRUIT), folder, seed=seed, settings=settings) as garden:
         task, _ = await ask(garden, {"kind": "inventory"}, HARVEST_WITHIN_S)
         if task["state"] != "done":

@@ -20,15 +20,14 @@ from core.errors import ConfigError
 from core.virtual import run_virtual
 from core.wire.market import FINAL_STATES
 from lab.garden import Garden
-from lab.orchard import PLANT, ROBOT, Matched, hanging, matched, one_plant, visible
+from lab.orchard import COUNTED_CONFIDENCE, PLANT, ROBOT, Matched, hanging, matched, one_plant, visible
 from lab.quiet import hush
 from lab.results import Result, held
+from lab.story import WATER_ONLY
 
 TRIALS = 6
 SCANS = 4
 SCAN_WITHIN_S = 300.0
-COUNTED_CONFIDENCE = 0.5
-"""A fruit that the plant believes in less is not counted."""
 
 Tell = Callable[[str], None]
 
@@ -62,7 +61,7 @@ def trial(seed: int, detector: str) -> Trial:
 async def _trial(seed: int, detector: str, folder: Path) -> Trial:
     scans: list[Scanned] = []
     failures: list[str] = []
-    settings = {ROBOT: {"ROBOT_DETECTOR": detector}, PLANT: {"PLANT_HARVEST": "false", "PLANT_INVENTORY": "false"}}
+    settings = {ROBOT: {"ROBOT_DETECTOR": detector}, PLANT: WATER_ONLY}
     async with Garden(one_plant(), folder, seed=seed, settings=settings) as garden:
         for _ in range(SCANS):
             task, scan_s = await ask(garden, {"kind": "inventory"}, SCAN_WITHIN_S)
