@@ -87,7 +87,7 @@ class ImpatientProtocol(HttpToolsProtocol):
             self._deadline = self.loop.call_later(REQUEST_WITHIN_S, self._too_slow)
         self._whole = False
         super().data_received(data)
-        if self._in_head:
+        if self._in_head and not self._whole:
             self._head_bytes += len(data)
             if self._head_bytes > HEAD_BYTES_MAX:
                 self._say_and_close(b"400 Bad Request", _BROKEN)

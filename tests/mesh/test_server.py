@@ -103,6 +103,16 @@ def test_two_lengths_are_refused_on_the_wire() -> None:
     asyncio.run(with_server(story))
 
 
+@pytest.mark.parametrize("length", [200, 17_000, 60_000])
+def test_a_body_may_be_longer_than_a_head_also_when_both_come_in_one_piece(length: int) -> None:
+    async def story(port: int) -> None:
+        body = b'{"status":"' + b"a" * (length - 13) + b'"}'
+        head = b"POST /x HTTP/1.1\r\nhost: a\r\nconnection: close\r\ncontent-type: application/json\r\n"
+        assert b" 200 " in await talk(port, head + b"content-length: %d\r\n\r\n" % length + body)
+
+    asyncio.run(with_server(story))
+
+
 def test_the_real_transport_reaches_the_real_server_and_events_stream() -> None:
     async def story(port: int) -> None:
         transport = HttpTransport()
