@@ -60,6 +60,7 @@ class Ssc32Driver(Session):
         self._reading: ServoReading | None = None
         self._known: set[int] = set()
         self._moved: set[int] = set()
+        self._told_us: dict[int, int] = {}
         self._buffer = bytearray()
         self._asked: tuple[int, ...] | None = None
         self._identified = False
@@ -91,6 +92,7 @@ class Ssc32Driver(Session):
         if lines and self._identified and self._send(lines):
             self._known |= first.keys()
             self._moved |= pulses.keys()
+            self._told_us |= {channel: round(pulse) for channel, pulse in pulses.items()}
             self._busy_until_s = max(self._busy_until_s, self._clock.now() + duration_s + SETTLE_S)
             self._wake.fire()
 
@@ -126,6 +128,7 @@ class Ssc32Driver(Session):
     def _gone(self) -> None:
         self._buffer.clear()
         self._known.clear()
+        self._told_us.clear()
         self._high.clear()
         self._asked = None
         self._identified = self._settled = False
@@ -213,12 +216,17 @@ class Ssc32Driver(Session):
         self._settled = True
         self._reading = ServoReading(
             stamp_s=self._clock.now(),
-            pulses_us={channel: count * 10.0 for channel, count in counts.items() if count},
+            pulses_us={channel: self._pulse_us(channel, count) for channel, count in counts.items() if count},
             moving=answer[-1:] == wire.MOVING,
             analog_v=analog,
         )
         self.silence_s = self._patience_s()
         self._heard()
+
+    def _pulse_us(self, channel: int, count: int) -> float:
+        """`QP` answers in tens of microseconds: where that agrees with what the channel was told, this is the finer word."""
+        seen_us, told_us = count * wire.QUERY_PULSE_US, self._told_us.get(channel)
+        return float(told_us) if told_us is not None and abs(told_us - seen_us) < wire.QUERY_PULSE_US else float(seen_us)
 
     def _learn(self, counts: Mapping[int, int]) -> None:
         """Channels the board drives are known; one that it drives no more tells of a lost supply."""

@@ -20,6 +20,8 @@ DONE, MOVING = b".", b"+"
 QUERY_MOVING = b"Q\r"
 VERSION = b"VER\r"
 LINE_CHARS_MAX = 1024
+QUERY_PULSE_US = 10
+"""`QP` answers a pulse in units of this."""
 ESC = b"\x1b"
 _IGNORED = bytes(byte for byte in range(256) if not 0x20 < byte < 0x7F and byte not in b"\r\x1b")
 

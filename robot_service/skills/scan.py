@@ -12,6 +12,7 @@ from core.inventory.sightings import View as ScanView
 from core.manipulation.eye import camera_pose, scan_poses
 from core.manipulation.kinematics import Array
 from core.manipulation.swing import swing
+from core.perception.detection import Detection
 from core.wire.fruit import FRUITS_MAX, Direction, Scan, Sighting, View
 from core.wire.market import PlantCard
 from robot_service.robot import Robot, SkillFailed
@@ -29,25 +30,26 @@ MARGIN_RATIO = 0.9
 
 async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Scan:
     """Look from six poses and fuse what was seen. Raises SkillFailed when the camera or the arm does not do its part."""
-    T_base_plant = plant_in_base(robot.pose(), plant)
-    T_plant_base = np.linalg.inv(T_base_plant)
     try:
-        poses = scan_poses(mapped(T_base_plant, (0.0, 0.0, 0.0)))
+        poses = scan_poses(mapped(plant_in_base(robot.pose(), plant), (0.0, 0.0, 0.0)))
     except Refused as error:
         raise SkillFailed(f"the arm cannot bring the camera before the plant: {error}") from error
-    views: list[ScanView] = []
+    seen: list[tuple[Array, tuple[Detection, ...]]] = []
     for number, q in enumerate(poses):
         await _go(robot, q)
         look = await robot.eye.look()
-        views.append(ScanView(T_plant_cam=T_plant_base @ camera_pose(joints_now(robot)), detections=look.detections))
+        seen.append((camera_pose(joints_now(robot)), look.detections))
         robot.activity.waiting = f"view {number + 1} of {len(poses)}: {len(look.detections)} fruit"
     robot.activity.waiting = ""
+    # The base has stood still, and knows its place better with every marker.
+    T_plant_base = np.linalg.inv(plant_in_base(robot.pose(), plant))
+    views = [ScanView(T_plant_cam=T_plant_base @ T_base_cam, detections=circles) for T_base_cam, circles in seen]
     await fold_arm(robot)
     camera = robot.eye.camera
     if await robot.clock.offload(lambda: upside_down(camera, views), 2 * FUSE_COST_S):
         raise SkillFailed("the pictures agree only when turned: the camera is mounted upside down")
-    seen = await robot.clock.offload(lambda: fuse(camera, views), FUSE_COST_S)
-    return document(robot, plant, scan_id, task_id, views, seen)
+    fruit = await robot.clock.offload(lambda: fuse(camera, views), FUSE_COST_S)
+    return document(robot, plant, scan_id, task_id, views, fruit)
 
 
 async def _go(robot: Robot, q: tuple[float, float, float, float]) -> None:

@@ -90,6 +90,32 @@ def test_the_reading_follows_the_board(at_desk: Run) -> None:
     at_desk(story)
 
 
+def test_a_pulse_that_has_arrived_reads_to_the_microsecond(at_desk: Run) -> None:
+    async def story(desk: Desk) -> None:
+        desk.driver.move({0: 1000}, 0.0)
+        desk.driver.move({0: 1234}, 0.5)
+        await desk.clock.sleep(1.5)
+        assert desk.driver.reading is not None
+        assert desk.driver.reading.pulses_us[0] == desk.rig.pulses_us[0] == 1234
+
+    at_desk(story)
+
+
+def test_a_pulse_that_stopped_elsewhere_reads_as_the_board_tells(at_desk: Run) -> None:
+    async def story(desk: Desk) -> None:
+        desk.driver.move({0: 1000}, 0.0)
+        desk.driver.move({0: 2000}, 1.0)
+        await desk.clock.sleep(0.5)
+        desk.driver.stop()
+        await desk.clock.sleep(1.5)
+        reading = desk.driver.reading
+        assert reading is not None
+        assert reading.pulses_us[0] == pytest.approx(desk.rig.pulses_us[0], abs=10)
+        assert reading.pulses_us[0] < 1900
+
+    at_desk(story)
+
+
 def test_the_invalid_first_analog_answer_is_never_shown(at_desk: Run) -> None:
     async def story(desk: Desk) -> None:
         assert desk.driver.reading is not None
