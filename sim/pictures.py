@@ -26,7 +26,7 @@ HAND_COST_S, DEPTH_COST_S = 0.20, 0.05
 
 
 class Pictures:
-    """Draws with numba, imported in the drawing thread: a world that nobody looks at never pays for it."""
+    """Draws with numba, imported before a world's robots look, else in the drawing thread: who never looks never pays."""
 
     def __init__(self, rig: Rig, clock: Clock) -> None:
         self._rig, self._clock = rig, clock

@@ -24,6 +24,7 @@ from core.mesh.worldclock import ClockBeat
 from core.scenario import Scenario, device_ports, find
 from core.wire.documents import Document, NodeCard
 from sim import settings as sim_settings
+from sim.camera import warm
 from sim.faults import KINDS, Fault, FaultRequest
 from sim.keeping import Keeper
 from sim.pictures import HAND_SIZE, Pictures
@@ -84,6 +85,9 @@ async def build(runtime: Runtime) -> Node:
     scenario = find(settings.scenario)
     seed = scenario.seed if settings.seed is None else settings.seed
     rig = assemble(scenario, seed, runtime.clock, settings.speed or scenario.speed)
+    if any(plant.inventory or plant.harvest for plant in scenario.plants):
+        # Robots will look. To load the kernels holds the interpreter for a second: not while the world moves.
+        await runtime.clock.offload(warm)
     loops: list[Loop] = []
     if settings.data is not None:
         keeper = Keeper(settings.data, rig.world, rig.faults, rig.clockwork)
