@@ -68,7 +68,7 @@ class BodyNode:
         self._resting = False
         self._kept_awake = False
         self._long_rest = False
-        self._active_s = self._woke_s = self._ticked_s = clock.now()
+        self._active_s = self._woke_s = self._ticked_s = self._due_s = clock.now()
         self._brains = 0
         self._verdict = Verdict()
         self.ticks = 0
@@ -204,7 +204,10 @@ class BodyNode:
     async def _pause(self) -> None:
         """Until the next turn; a resting body is woken early."""
         if not self._resting:
-            await self._clock.sleep(DT_S)
+            # A turn that came a little late does not put off the next: 50 Hz on the whole.
+            now_s, due_s = self._clock.now(), self._due_s + DT_S
+            self._due_s = due_s if due_s > now_s else now_s + DT_S
+            await self._clock.sleep(self._due_s - now_s)
             return
         self._woken.clear()
         try:
