@@ -22,6 +22,7 @@ BENCHES = {
     "pot": "lab.bench.pot:bench_pot",
     "broadcast": "lab.bench.broadcast:bench_broadcast",
     "detector": "lab.bench.detector:bench_detector",
+    "vision": "lab.bench.vision:bench_vision",
 }
 """Each is a function (n) -> rows {name, ours, peer, ratio, unit, n}; a row may carry target and ok."""
 
