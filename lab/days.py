@@ -182,8 +182,7 @@ class _Judge:
             self._scans[plant_id] = document["scans"]
             known = [f for f in document["fruits"] if f["confidence"] >= COUNTED_CONFIDENCE]
             truth = self._hanging(plant_id)
-            robot = next(r for r in self.garden.truth().robots if r.docked_at == plant_id)
-            seen = visible(self.garden.world, robot.pose, truth)
+            seen = visible(self.garden.world, self._stood(plant_id), truth)
             pairs = matched(known, truth)
             entered = {index for index, _, _ in pairs.pairs}
             phantom = [fruit for index, fruit in enumerate(known) if index not in entered]
@@ -199,6 +198,11 @@ class _Judge:
                     doubled=tuple(f["fruit_id"] for f in phantom if _within(f, own)),
                 )
             )
+
+    def _stood(self, plant_id: str) -> Pose2:
+        """Where the robot stands that has scanned; one that has just left stood at the dock."""
+        docked = (robot.pose for robot in self.garden.truth().robots if robot.docked_at == plant_id)
+        return next(docked, self._docks[plant_id])
 
     def _hanging(self, plant_id: str) -> list[FruitTruth]:
         return [fruit for fruit in self.garden.truth().plant(plant_id).fruit if fruit.where == "plant"]
