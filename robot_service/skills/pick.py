@@ -41,6 +41,8 @@ from robot_service.skills.plantframe import mapped, plant_in_base
 
 WAYS_MAX = 3
 """From so many directions a fruit is looked for before it is given up."""
+WAYS_COST_S = 0.012
+"""To find and price the ways to one fruit among twenty."""
 LOOKS_MAX = 10
 """Of one servo run."""
 BLIND_MAX = 2
@@ -115,12 +117,12 @@ async def harvest(
     hanging = {fruit.fruit_id: fruit for fruit in (*known, *fruits)}
     picked = 0
     while left and picked < count:
-        fruit = _outermost(task, left, list(hanging.values()))
+        fruit, ways = await _outermost(task, left, list(hanging.values()))
         left.remove(fruit)
         others = [other for other in hanging.values() if other.fruit_id != fruit.fruit_id]
         robot.activity.waiting = f"picks {fruit.fruit_id}, {picked} of {count} in the basket"
         began_s = robot.clock.now()
-        pick = await _pick(task, fruit, others)
+        pick = await _pick(task, fruit, others, ways)
         ended(pick.model_copy(update={"took_s": robot.clock.now() - began_s}))
         if pick.outcome == "picked":
             picked += 1
@@ -138,35 +140,54 @@ def _obstacles(task: Task, fruits: Sequence[Fruit]) -> list[Obstacle]:
     return [Obstacle(centre=_place(task, fruit), radius_m=fruit.radius_m) for fruit in fruits]
 
 
-def _outermost(task: Task, left: Sequence[Fruit], hanging: Sequence[Fruit]) -> Fruit:
-    """The fruit with the most room about it; ties by the order asked for."""
-
-    def room(fruit: Fruit) -> float:
-        others = [other for other in hanging if other.fruit_id != fruit.fruit_id]
-        try:
-            return approaches(_place(task, fruit), fruit.radius_m, _obstacles(task, others), _rolls(task.robot))[0].room_m
-        except Refused:
-            return -1.0
-
-    return max(left, key=room)
+Ways = list[Approach] | Refused
+"""How the hand can go, the best way first, or why it cannot."""
 
 
-async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit]) -> Pick:
+async def _outermost(task: Task, left: Sequence[Fruit], hanging: Sequence[Fruit]) -> tuple[Fruit, Ways]:
+    """The fruit with the most room about it, and the ways to it; ties by the order asked for."""
+    ways = await _ways(task, left, hanging)
+    room_m = [found[0].room_m if isinstance(found, list) else -1.0 for found in ways]
+    best = room_m.index(max(room_m))
+    return left[best], ways[best]
+
+
+async def _ways(task: Task, fruits: Sequence[Fruit], hanging: Sequence[Fruit]) -> list[Ways]:
+    """The ways to each of `fruits` among all that hang. Off the loop: it takes time."""
+    rolls_rad = _rolls(task.robot)
+    asked = [
+        (_place(task, fruit), fruit.radius_m, _obstacles(task, [o for o in hanging if o.fruit_id != fruit.fruit_id]))
+        for fruit in fruits
+    ]
+
+    def priced() -> list[Ways]:
+        return [_ways_or_why(place, radius_m, others, rolls_rad) for place, radius_m, others in asked]
+
+    return await task.robot.clock.offload(priced, WAYS_COST_S * len(asked))
+
+
+def _ways_or_why(place: Point3, radius_m: float, others: Sequence[Obstacle], rolls_rad: Sequence[float]) -> Ways:
+    try:
+        return approaches(place, radius_m, others, rolls_rad)
+    except Refused as refusal:
+        return refusal
+
+
+async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit], ways: Ways) -> Pick:
     """One fruit, from looking for it to the basket: from other sides, then from another place, then given up."""
     why = ""
     for place in range(PLACES_MAX):
         if place:
             await _shift(task.robot, _place(task, fruit)[1])
-        try:
-            ways = approaches(_place(task, fruit), fruit.radius_m, _obstacles(task, others), _rolls(task.robot))
-        except Refused as error:
+            ways = (await _ways(task, [fruit], others))[0]
+        if isinstance(ways, Refused):
             if place:
                 break
-            return Pick(fruit_id=fruit.fruit_id, outcome="unreachable", reason=str(error)[:500])
-        ways = [way for way in ways if way.room_m >= ROOM_M_MIN]
-        if not ways:
+            return Pick(fruit_id=fruit.fruit_id, outcome="unreachable", reason=str(ways)[:500])
+        roomy = [way for way in ways if way.room_m >= ROOM_M_MIN]
+        if not roomy:
             return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason="other fruit hangs in the way of the hand")
-        for way in ways[:WAYS_MAX]:
+        for way in roomy[:WAYS_MAX]:
             target, near = _expected(task, fruit), [_expected(task, other) for other in others]
             try:
                 await _swing(task.robot, way.look, Grip(way.opening_m, way.roll_rad))
