@@ -1,8 +1,9 @@
 """`garden bench vision`: how soon a robot answers bids, and how evenly its body turns, while it scans and picks.
 
 Real processes on loopback, at the speed of life: the world, a pot, one robot's brain and its body. The stream between brain
-and body runs through us, so that the body's own stamps tell its turns; a client asks for bids all the while. What counts
-is the time in which the robot acts at the plant's dock: pictures, detection, fusing, ways of the hand, servo.
+and body runs through us: the body tells its state at every turn of its control loop, so that what arrives tells its turns
+(and our own delay with them). A client asks for bids all the while. What counts is the time in which the robot acts at the
+plant's dock: pictures, detection, fusing, ways of the hand, servo.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class Watched:
 
     bids_ms: list[float] = field(default_factory=list)
     turns_ms: list[float] = field(default_factory=list)
-    """Garden milliseconds between two turns of the body."""
+    """Between two states of the body."""
     acted_s: float = 0.0
     jobs: set[str] = field(default_factory=set)
     """Kinds of tasks that the robot acted for."""
@@ -139,14 +140,14 @@ async def _asked(mesh: Mesh, listed: dict[str, Process], seconds: float, tap: _T
         if time.monotonic() > ends_s:
             raise ConfigError(f"the robot acted only {watched.acted_s:.0f} s of {seconds:g}", hint="look at its log")
         before, began_s = await _job(mesh, robot), time.monotonic()
-        tap.stamps_s.clear()
+        tap.heard_s.clear()
         bids_ms = [await _bid_ms(mesh, robot, asked) for _ in range(LOOK_EVERY)]
-        stamps_s = list(tap.stamps_s)
+        heard_s = list(tap.heard_s)
         if before == await _job(mesh, robot) and before.startswith("act"):
             watched.acted_s += time.monotonic() - began_s
             watched.jobs.add(before)
             watched.bids_ms += bids_ms
-            watched.turns_ms += [1e3 * (b - a) for a, b in pairwise(stamps_s)]
+            watched.turns_ms += [1e3 * (b - a) for a, b in pairwise(heard_s)]
 
 
 async def _keep_busy(mesh: Mesh, plant: Peer) -> None:
@@ -183,11 +184,11 @@ async def _bid_ms(mesh: Mesh, robot: Peer, asked: Announcement) -> float:
 
 
 class _Tap:
-    """Carries the stream between brain and body, and keeps the stamps of the body's states."""
+    """Carries the stream between brain and body, and keeps when the body told a state."""
 
     def __init__(self, path: Path, body: Path) -> None:
         self.path, self._body = path, body
-        self.stamps_s: list[float] = []
+        self.heard_s: list[float] = []
 
     @asynccontextmanager
     async def listening(self) -> AsyncIterator[None]:
@@ -227,7 +228,7 @@ class _Tap:
         lines = LineBuffer()
 
         def hear(data: bytes) -> None:
-            said = (decode(line) for line in lines.feed(data))
-            self.stamps_s += [state.stamp_s for state in said if isinstance(state, BodyState)]
+            states = [line for line in lines.feed(data) if isinstance(decode(line), BodyState)]
+            self.heard_s += [time.monotonic()] * len(states)
 
         return hear
