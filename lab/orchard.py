@@ -81,9 +81,12 @@ def visible(world: World, pose: Pose2, hanging: list[FruitTruth]) -> set[str]:
     own = np.array([world.model.body(int(b)).rootid[0] for b in body])
     robot = int(world.model.body(ROBOT).id)
     geoms = replace(geoms, visible=geoms.visible & (own != robot))
+    T_base = _pose_matrix(pose)
+    x_m, y_m = min((pot.place for pot in world.pots.values()), key=lambda at: math.dist(at, (pose.x_m, pose.y_m)))
+    stem = np.linalg.inv(T_base) @ (x_m, y_m, 0.0, 1.0)
     seen: set[str] = set()
-    for q in scan_poses():
-        T = _pose_matrix(pose) @ camera_pose(q)
+    for q in scan_poses((float(stem[0]), float(stem[1]), 0.0)):
+        T = T_base @ camera_pose(q)
         ids = rasterise(camera, T, geoms, normals=False).ids
         for fruit in hanging:
             p = np.array([fruit.position_world.x_m, fruit.position_world.y_m, fruit.position_world.z_m])

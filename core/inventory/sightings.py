@@ -19,8 +19,8 @@ from core.perception.detection import COLOURS, Colour, Detection
 
 Array = NDArray[np.float64]
 
-RADIUS_PRIOR_SIGMA_M = 0.003
-"""How fruit differ in size."""
+RADIUS_PRIOR_SIGMA_M = 0.005
+"""How fruit of all ages differ in size."""
 BEARING_SIGMA_PX = 1.5
 BEARING_SIGMA_RATIO = 0.08
 """Part of the circle's radius by which its centre is off: leaves cut pieces off a fruit."""

@@ -25,11 +25,18 @@ T_HAND_CAM: Array = np.array(
 )
 """The camera looks along the hand; the top of its picture is the hand's upper side."""
 
-SCAN_PANS_RAD = (math.radians(17.0), math.radians(-17.0))
-SCAN_HEIGHTS_M = (0.38, 0.56, 0.74)
-"""Of the camera above the floor."""
-SCAN_LOOKS_AT_M = (0.52, 0.58, 0.66)
-"""Height of the point on the stem's axis that each of them looks at: pictures overlap, so that fruit are triangulated."""
+SCAN_VIEWS = (
+    (math.radians(-12.0), 0.36, 0.46),
+    (math.radians(-12.0), 0.42, 0.57),
+    (math.radians(12.0), 0.54, 0.64),
+    (math.radians(12.0), 0.60, 0.45),
+    (math.radians(-12.0), 0.72, 0.67),
+    (math.radians(12.0), 0.78, 0.73),
+)
+"""Bearing beside the stem's; heights of the camera and of the point on the stem's axis that it looks at, above the floor [m].
+
+Six different heights, because the arm lets the camera rise much further than it can go aside: chosen on 12 plants so that
+nearly every fruit is in three pictures, from places far enough apart to tell its distance."""
 SCAN_STAND_OFF_M = 0.42
 """From the camera to the stem, seen from above: as far back as the arm can fold."""
 
@@ -49,16 +56,12 @@ def looking(camera_base_m: Point3, pitch_rad: float) -> Joints:
 
 
 def scan_poses(stem_base_m: Point3 = (DOCK_TO_STEM_M, 0.0, 0.0)) -> tuple[Joints, ...]:
-    """The six camera poses of an inventory (paper 000, section 5): two bearings by three heights, in a snake.
+    """The six camera poses of an inventory (paper 000, section 5), from the lowest to the highest.
 
     A height that the arm cannot reach at the wanted stand-off is taken a little further from or nearer to the plant.
     """
-    poses: list[Joints] = []
     bearing_rad = math.atan2(stem_base_m[1], stem_base_m[0] - SHOULDER_X_M)
-    for row, (z_m, aim_z_m) in enumerate(zip(SCAN_HEIGHTS_M, SCAN_LOOKS_AT_M, strict=True)):
-        pans = SCAN_PANS_RAD if row % 2 == 0 else SCAN_PANS_RAD[::-1]
-        poses += [_nearest_pose(stem_base_m, bearing_rad + pan, z_m, aim_z_m) for pan in pans]
-    return tuple(poses)
+    return tuple(_nearest_pose(stem_base_m, bearing_rad + pan_rad, z_m, aim_z_m) for pan_rad, z_m, aim_z_m in SCAN_VIEWS)
 
 
 def _nearest_pose(stem_base_m: Point3, pan_rad: float, z_m: float, aim_z_m: float) -> Joints:
