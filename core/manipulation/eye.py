@@ -33,7 +33,7 @@ SCAN_VIEWS = (
     (math.radians(-12.0), 0.72, 0.67),
     (math.radians(12.0), 0.78, 0.73),
 )
-"""Bearing beside the stem's; heights of the camera and of the point on the stem's axis that it looks at, above the floor [m].
+"""Bearing beside the stem's; heights above the floor of the camera and of the point on the stem's axis it looks at [m].
 
 Six different heights, because the arm lets the camera rise much further than it can go aside: chosen on 12 plants so that
 nearly every fruit is in three pictures, from places far enough apart to tell its distance."""
