@@ -19,6 +19,7 @@ from core.store import Disk, DurableDocument
 from core.wire.plant import SettingsPatch
 from hw.drivers.probes import open_probe, open_valve
 from hw.links import Opener
+from hw.ports import SoilProbe, Valve
 from plant_service import api
 from plant_service.inventory import Fruits, InventoryDocument
 from plant_service.journal import Journal
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 GATHER_S = 0.002
 """Those who write many fruits at once share their commits."""
 Loop = Callable[[], Awaitable[None]]
+OpenProbe = Callable[[str, Opener, Clock], SoilProbe]
+OpenValve = Callable[[str, Opener, Clock], Valve]
 
 
 def build(
@@ -52,16 +55,21 @@ def build(
     peers: Peers | None = None,
     open_reads: bool = True,
     disk: Disk | None = None,
+    probes: OpenProbe = open_probe,
+    valves: OpenValve = open_valve,
 ) -> Node:
     """The node `settings` describe. Call inside the loop; raises StorageError, ConfigError.
 
     The data folder belongs to the node from here on, until its loops are cancelled. `verifier` None switches
     authentication off (tests). Nothing here is left to chance: `rng` is there for the shape all services share.
+    `probes` and `valves` open the devices their URLs name.
     """
     journal = Journal(settings.id, settings.folder / "history.sqlite3", clock)
     maker = build_pot if settings.kind == "pot" else build_station
     mesh = Mesh(transport, identity, clock)
-    return maker(_Parts(settings, clock, opener, mesh, verifier, peers or Peers(), journal, open_reads, disk))
+    parts = _Parts(settings, clock, opener, mesh, verifier, peers or Peers(), journal, open_reads, disk)
+    parts.probes, parts.valves = probes, valves
+    return maker(parts)
 
 
 class _Parts:
@@ -81,6 +89,8 @@ class _Parts:
     ) -> None:
         self.settings, self.clock, self.opener, self.mesh = settings, clock, opener, mesh
         self.verifier, self.peers, self.journal, self.open_reads, self.disk = verifier, peers, journal, open_reads, disk
+        self.probes: OpenProbe = open_probe
+        self.valves: OpenValve = open_valve
 
     def file(self, name: str, gather_s: float = 0.0) -> DurableDocument:
         return DurableDocument(self.settings.folder / f"{name}.json", f"{name}/1", self.clock, self.disk, gather_s)
@@ -107,7 +117,7 @@ def build_pot(parts: _Parts) -> Node:
     lines = Keeper(parts.file("ledger"), LedgerDocument, Lines)
     care = Keeper(parts.file("settings"), SettingsPatch, lambda doc: Care(base, doc))
     docks = parts.docks([settings.id])
-    probe = open_probe(settings.probe_url, parts.opener, clock)
+    probe = parts.probes(settings.probe_url, parts.opener, clock)
     place = Marketplace(market, parts.mesh, parts.peers, clock, journal)
     book = Ledger(lines, settings.folder / "pictures", clock, parts.disk)
     tending = Tending(fruits, Shelf(fruits, clock, texts), book, place, clock, journal)
@@ -119,12 +129,13 @@ def build_pot(parts: _Parts) -> Node:
         open_reads=parts.open_reads,
     )  # fmt: skip
     api.add_pot(app, pot)
+    app.state.pot = pot
     return Node(settings.id, "plant", app, (probe.run, pot.watch, _closing(place.run, keepers), journal.run))
 
 
 def build_station(parts: _Parts) -> Node:
     settings, clock, journal = parts.settings, parts.clock, parts.journal
-    valve = open_valve(settings.tap_url, parts.opener, clock) if settings.tap_url else None
+    valve = parts.valves(settings.tap_url, parts.opener, clock) if settings.tap_url else None
     docks = parts.docks([dock.id for dock in settings.docks])
     meter = Keeper(parts.file("tap"), TapDocument, Meter)
     station = Station(settings, clock, valve, docks, meter, journal)

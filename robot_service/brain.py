@@ -33,7 +33,7 @@ from robot_service.eye import Eye
 from robot_service.ground import Ground
 from robot_service.localisation import Localisation
 from robot_service.neighbours import Neighbours
-from robot_service.planner import Planner
+from robot_service.planner import Hand, Planner
 from robot_service.reporter import Reporter
 from robot_service.robot import Robot, launch_of
 from robot_service.scheduler import Scheduler
@@ -58,6 +58,7 @@ class Brain:
         peers: Peers,
         rng: random.Random,
         eye: Eye,
+        hand: Hand | None = None,
     ) -> None:
         self.settings, self.clock = settings, clock
         self.body = BodyLink(settings.body_url, settings.secret(), opener, clock)
@@ -71,7 +72,7 @@ class Brain:
         self.docks = Docks(settings.id, mesh, peers, clock, neighbours.calm)
         self.queue = TaskQueue()
         self.reporter = Reporter(self.robot, self.queue)
-        planner = Planner(self.robot, self.docks, self.travel_s)
+        planner = Planner(self.robot, self.docks, self.travel_s, hand or Hand())
         self.scheduler = Scheduler(self.robot, self.docks, planner, self.queue, self.reporter)
         self.reporter.kill = self.scheduler.kill
         self._stopped = True
@@ -353,18 +354,20 @@ def build(
     peers: Peers | None = None,
     open_reads: bool = True,
     cameras: httpx.AsyncBaseTransport | None = None,
+    eye: Eye | None = None,
+    hand: Hand | None = None,
 ) -> Node:
     """One robot's brain as a node. `verifier` None switches authentication off, for tests.
 
-    `cameras` carries the HTTP of its camera; None: the network.
+    `cameras` carries the HTTP of its camera; None: the network. `eye` and `hand` take the place of those it would make.
     """
     from robot_service.api import make_app
 
     mesh = Mesh(transport, identity, clock)
     lens = from_fov(*gardener.CAMERA_PIXELS, math.radians(gardener.CAMERA_FOV_Y_DEG))
     camera = open_camera(settings.camera_url, clock, cameras) if settings.camera_url else None
-    eye = Eye(camera, settings.detector, lens, clock)
-    brain = Brain(settings, clock, opener, mesh, peers if peers is not None else Peers(), rng, eye)
+    eye = eye or Eye(camera, settings.detector, lens, clock)
+    brain = Brain(settings, clock, opener, mesh, peers if peers is not None else Peers(), rng, eye, hand)
     app = make_app(brain, verifier, open_reads)
     app.state.brain = brain
     loops = [brain.body.run, brain.robot.neighbours.run, brain.docks.run, brain.reporter.run, brain.scheduler.run]

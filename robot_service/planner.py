@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from core.allocation.bidding import BATTERY_ENOUGH_RATIO, Travel
 from core.allocation.queue import Entry
 from core.errors import GardenError, PeerDown
 from core.mesh.client import retry
-from core.wire.fruit import Fruit, Inventory, Pick
-from core.wire.market import Announcement, Permit, PermitRequest, Report
+from core.wire.fruit import Fruit, Inventory, Pick, Scan
+from core.wire.market import Announcement, Permit, PermitRequest, PlantCard, Report
 from core.wire.robot import JobRequest
 from robot_service.docks import Docks
 from robot_service.eye import JPEG_COST_S, Look, drawn_jpeg
@@ -25,11 +26,21 @@ TASK_S = {"water": 900.0, "inventory": 600.0, "harvest": 1800.0, "charge": 5 * 3
 """Longest time for a whole task; a longer one is given back."""
 
 
+@dataclass(frozen=True, slots=True)
+class Hand:
+    """What eye and hand do at a dock: the skills that need a camera. Another hand may be given to a brain."""
+
+    scan: Callable[[Robot, PlantCard, str, str], Awaitable[Scan]] = scan
+    harvest: Callable[..., Awaitable[None]] = harvest
+    empty: Callable[[Robot], Awaitable[None]] = empty_hand
+
+
 @dataclass(slots=True)
 class Planner:
     robot: Robot
     docks: Docks
     travel: Travel
+    hand: Hand = Hand()
 
     async def run(self, entry: Entry) -> Report:
         """Do one entry; the report says how it ended. Never raises SkillFailed."""
@@ -86,9 +97,9 @@ class Planner:
         await dock_at(self.robot, self.docks, asked.plant.plant_id)
         self.robot.activity.job = "act"
         entry.progress = 0.4
-        await empty_hand(self.robot)
+        await self.hand.empty(self.robot)
         scan_id = f"{asked.task_id}:{self.robot.settings.id}:{entry.epoch}"
-        seen = await scan(self.robot, asked.plant, scan_id, asked.task_id)
+        seen = await self.hand.scan(self.robot, asked.plant, scan_id, asked.task_id)
         entry.progress = 0.9
         plant = self.robot.peers.get(asked.plant.plant_id)
 
@@ -106,7 +117,7 @@ class Planner:
         await dock_at(self.robot, self.docks, asked.plant.plant_id)
         self.robot.activity.job = "act"
         entry.progress = 0.3
-        await empty_hand(self.robot)
+        await self.hand.empty(self.robot)
         wanted = asked.count or len(asked.fruits)
 
         async def leave(fruit_id: str) -> tuple[Permit, float]:
@@ -125,7 +136,8 @@ class Planner:
 
         before = len(entry.picks)
         known = await self._known(asked)
-        await harvest(self.robot, asked.plant, asked.fruits, wanted, leave, self._keep_picture(asked), ended, known)
+        keep = self._keep_picture(asked)
+        await self.hand.harvest(self.robot, asked.plant, asked.fruits, wanted, leave, keep, ended, known)
         picks = entry.picks[before:]
         if not any(pick.outcome == "picked" for pick in picks):
             raise SkillFailed("; ".join(f"{pick.fruit_id}: {pick.reason}" for pick in picks)[:400] or "nothing to pick")

@@ -15,6 +15,7 @@ import structlog
 from core.clock import Clock
 from core.errors import StorageError
 from core.robots import gardener
+from core.store import Disk
 from core.wire.body import COMMAND_LIFE_S, BodyState, Control, Setpoint
 from hw.drivers.create import CreateDriver
 from hw.drivers.ssc32 import Ssc32Driver
@@ -53,10 +54,17 @@ class Drivers:
 class BodyNode:
     """Run all of `loops` together; when one ends, end them all."""
 
-    def __init__(self, settings: BodySettings, clock: Clock, drivers: Drivers, memory: MemoryListen | None = None) -> None:
+    def __init__(
+        self,
+        settings: BodySettings,
+        clock: Clock,
+        drivers: Drivers,
+        memory: MemoryListen | None = None,
+        disk: Disk | None = None,
+    ) -> None:
         self._clock, self._drivers = clock, drivers
-        self.ledger = Ledger(settings.data, settings.caps, clock)
-        self.latch = StopLatch(settings.data, clock)
+        self.ledger = Ledger(settings.data, settings.caps, clock, disk)
+        self.latch = StopLatch(settings.data, clock, disk)
         self.senses = Senses(drivers.base, drivers.servos, drivers.localizer)
         self.actuators = Actuators(drivers.base, drivers.servos)
         self.doser = Doser(self.ledger, self.actuators, clock)
@@ -277,9 +285,10 @@ def build_body(
     opener: Opener,
     memory: MemoryListen | None = None,
     drivers: Drivers | None = None,
+    disk: Disk | None = None,
 ) -> BodyNode:
     """A body ready to run. `memory` is `MemoryNet.listen` for a brain in the same process.
 
     Raises ConfigError without a secret and StorageError when its files cannot be trusted.
     """
-    return BodyNode(settings, clock, drivers or make_drivers(settings, clock, opener), memory)
+    return BodyNode(settings, clock, drivers or make_drivers(settings, clock, opener), memory, disk)

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from core.clock import Clock
 from core.errors import StorageError
-from core.store import DurableDocument
+from core.store import Disk, DurableDocument
 
 HOUR_S, DAY_S = 3600.0, 86400.0
 DOSES_SCHEMA, STOP_SCHEMA = "body-doses/1", "body-stop/1"
@@ -55,8 +55,8 @@ class _Stop(BaseModel):
 class Ledger:
     """The doses written off."""
 
-    def __init__(self, folder: Path, caps: Caps, clock: Clock) -> None:
-        self._document = DurableDocument(folder / "doses.json", DOSES_SCHEMA, clock)
+    def __init__(self, folder: Path, caps: Caps, clock: Clock, disk: Disk | None = None) -> None:
+        self._document = DurableDocument(folder / "doses.json", DOSES_SCHEMA, clock, disk)
         self._caps, self._clock = caps, clock
         self._spent: dict[str, float] = {}
         self._recent: list[_Debit] = []
@@ -113,8 +113,8 @@ class Ledger:
 class StopLatch:
     """The e-stop. It latches at once; that it did is durable a moment later. It is released only when that is durable."""
 
-    def __init__(self, folder: Path, clock: Clock) -> None:
-        self._document = DurableDocument(folder / "stop.json", STOP_SCHEMA, clock)
+    def __init__(self, folder: Path, clock: Clock, disk: Disk | None = None) -> None:
+        self._document = DurableDocument(folder / "stop.json", STOP_SCHEMA, clock, disk)
         self.stopped = True
         self.by = "not started yet"
 

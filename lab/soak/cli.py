@@ -1,0 +1,77 @@
+"""`garden soak`: many gardens on all cores, every invariant judged, one line to replay whatever broke."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from lab.soak.run import Outcome, Plan, as_json, soak
+
+FIRST = 1
+
+
+def soak_all(plans: list[Plan], jobs: int, told: Callable[[Outcome], None]) -> list[Outcome]:
+    """Run them on `jobs` processes; `told` hears of each as it ends. In the order of the plans."""
+    if jobs <= 1 or len(plans) <= 1:
+        return [_told(soak(plan), told) for plan in plans]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(plans)), mp_context=context) as pool:
+        futures = [pool.submit(soak, plan) for plan in plans]
+        for future in as_completed(futures):
+            told(future.result())
+        return [future.result() for future in futures]
+
+
+def _told(outcome: Outcome, told: Callable[[Outcome], None]) -> Outcome:
+    told(outcome)
+    return outcome
+
+
+def soak_command(
+    days: Annotated[float, typer.Option(min=0.01, help="Garden days a seed")] = 0.5,
+    seeds: Annotated[int, typer.Option(min=1, help="How many gardens")] = 2,
+    first: Annotated[
+        int, typer.Option("--first", "--seed", min=0, help="The first garden's seed; the others follow")
+    ] = FIRST,
+    jobs: Annotated[int, typer.Option(min=0, help="Processes; 0: one a core")] = 0,
+    as_one_json: Annotated[bool, typer.Option("--json", help="Print one JSON document")] = False,
+) -> None:
+    """Live through whole gardens with faults on virtual time and judge every invariant. Exit 1 when one broke."""
+    tell = Console(stderr=True)
+    plans = [Plan(seed=seed, days=days) for seed in range(first, first + seeds)]
+    ended = 0
+
+    def told(outcome: Outcome) -> None:
+        nonlocal ended
+        ended += 1
+        broken = f", [bold red]{len(outcome.breaches)} broken[/]" if outcome.breaches else ""
+        faults = sum(outcome.faults.values())
+        tell.print(f"{ended}/{seeds} seed {outcome.seed}: {outcome.tally.tasks} tasks, {faults} faults{broken}")
+        for line in _lines(outcome):
+            tell.print(line, highlight=False, markup=False)
+
+    outcomes = soak_all(plans, jobs or len(os.sched_getaffinity(0)), told)
+    document = as_json(outcomes)
+    if as_one_json:
+        print(json.dumps(document))
+    else:
+        for name, value in document.items():
+            print(f"{name}: {json.dumps(value)}")
+    if document["broken_invariants"]:
+        sys.exit(1)
+
+
+def _lines(outcome: Outcome) -> Iterator[str]:
+    for breach in outcome.breaches:
+        yield f"  {breach.invariant} at {breach.at_s:.1f} s: {breach.what}"
+        yield from (f"      {line}" for line in breach.story)
+    if outcome.breaches:
+        yield f"  replay: {Plan(seed=outcome.seed, days=outcome.days).replay()}"

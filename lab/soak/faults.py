@@ -1,0 +1,383 @@
+"""What goes wrong in a soaked garden: drawn by the seed, at random and at the worst instants by name, and mended again.
+
+`Gremlin.touches` counts by node how often a fault met it, and `touched_s` when last: judges allow for that.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import errno
+import json
+import math
+import random
+from collections import Counter, defaultdict
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+from core.mesh.client import Answer
+from lab.soak.garden import Hooks, Running, SoakGarden
+from lab.soak.life import NodeClock, skewed
+from lab.soak.net import CLEAR, Message, Weather
+from lab.soak.world import Dose, Truth
+
+LEASE_S = 8.0
+DOWN_S = (0.5, 4.0, 20.0, 90.0)
+"""How long a dead process stays dead: shorter and longer than leases, permits and a pot's patience."""
+PAUSE_S = (0.4, 3.0, 12.0, 40.0)
+CALM_EVERY_S, CALM_S = 3 * 3600.0, 2400.0
+"""So often everything is mended and left alone for so long: what does not come right then never does."""
+STORMS = (
+    Weather(request_lost=0.1, reply_lost=0.1),
+    Weather(reply_lost=0.4),
+    Weather(duplicated=0.4, reordered=0.3),
+    Weather(late=0.15, duplicated=0.2, reordered=0.4),
+    Weather(request_lost=0.2, reply_lost=0.2, duplicated=0.05, late=0.05, reordered=0.2),
+)
+WORST = {
+    "permit_reply_lost": 0.06, "award_reply_lost": 0.06, "end_report_lost": 0.08, "end_reply_lost": 0.08,
+    "scan_reply_lost": 0.08, "kill_lost": 0.15,
+}  # fmt: skip
+"""Chance that just this message is lost, while faults are on."""
+FATAL = {
+    "death_after_act": 0.10, "death_before_act": 0.05, "crash_after_permit": 0.05, "crash_after_award": 0.05,
+    "crash_on_end": 0.05,
+}  # fmt: skip
+"""Chance that a process dies at this instant."""
+DISK = ("crash_before_write", "crash_in_write", "crash_after_write", "disk_eio", "disk_enospc", "torn_write", "fsync_error")
+MEND_AFTER_S = 45.0
+
+
+class Died(BaseException):
+    """Thrown where a process is killed in the middle of what it does."""
+
+
+class Gremlin:
+    """Works on one garden until cancelled. `on` is false while everything shall heal."""
+
+    def __init__(self, rng: random.Random, truth: Truth, counts: Counter[str]) -> None:
+        self.rng, self.truth, self.counts = rng, truth, counts
+        self.garden: SoakGarden
+        self.on = False
+        self.touches: Counter[str] = Counter()
+        self.touched_s: defaultdict[str, float] = defaultdict(lambda: -math.inf)
+        self.stopped_s: dict[str, float] = {}
+        """Robots whose e-stop somebody pressed."""
+        self._disk: dict[str, str] = {}
+        self._context = contextvars.copy_context()
+        """Nobody's: what heals a process must not die with it."""
+        self._healing: set[asyncio.Task[None]] = set()
+        self.halted: Callable[[str], None] = lambda name: None
+        """A brain died, or sleeps: its robot must stop."""
+        self.crashed: Callable[[str], None] = lambda name: None
+
+    def hooks(self, moved: Callable[[str], None], died: Callable[[str, BaseException], None]) -> Hooks:
+        return Hooks(disk=self._at_disk, poured=self._poured, picked=self._picked, moved=moved, died=died, clock=self._clock)
+
+    def attach(self, garden: SoakGarden) -> None:
+        self.garden = garden
+        garden.mesh.worst = self._worst
+        garden.mesh.touched = lambda kind, source, target, body: self.touch(source, target)
+
+    def touch(self, *names: str) -> None:
+        now_s = self.truth.now()
+        for name in names:
+            self.touches[name] += 1
+            self.touched_s[name] = now_s
+
+    def strike(self, kind: str, *names: str) -> None:
+        self.counts[kind] += 1
+        self.touch(*names)
+
+    # At random
+
+    async def run(self) -> None:
+        """Faults for a while, then calm, for ever."""
+        while True:
+            self.on = True
+            until_s = self.truth.now() + CALM_EVERY_S - CALM_S
+            while self.truth.now() < until_s:
+                await asyncio.sleep(self.rng.expovariate(1 / 240.0))
+                await self._one()
+            self.heal_all()
+            await asyncio.sleep(CALM_S)
+
+    async def _one(self) -> None:
+        kinds: list[Callable[[], Awaitable[None]]] = [
+            self._storm, self._storm, self._storm, self._cut, self._partition, self._crash, self._crash, self._crash,
+            self._pause, self._pause, self._arm_disk, self._arm_disk, self._battery, self._pump, self._tap, self._probe,
+            self._power_cycle,
+        ]  # fmt: skip
+        self._later(self.rng.choice(kinds)())
+
+    def _later(self, work: Awaitable[None]) -> None:
+        task = asyncio.get_running_loop().create_task(_await(work), context=self._context.copy())
+        self._healing.add(task)
+        task.add_done_callback(self._healing.discard)
+
+    def heal_all(self) -> None:
+        """Everything is mended now."""
+        self.on = False
+        for task in self._healing:
+            task.cancel()
+        self.garden.mesh.weather, self._disk = CLEAR, {}
+        self.garden.mesh.cut.clear()
+        self.truth.water_out = False
+        for pot in self.truth.pots.values():
+            pot.probe_silent = False
+        for body in self.truth.robots.values():
+            body.pump_broken = False
+            self._carry(body.name)
+        for name in self.garden.processes:
+            running = self.garden.running.get(name)
+            if running is None:
+                self.garden.start(name)
+            elif running.life.stopped:
+                running.life.go_on()
+            elif _broken(running):
+                self.garden.kill(name)
+                self.garden.start(name)
+            self.touch(name)
+
+    def _nodes(self) -> list[str]:
+        return [name for name in self.garden.processes if self.garden.processes[name].kind != "body"]
+
+    async def _storm(self) -> None:
+        self.garden.mesh.weather = self.rng.choice(STORMS)
+        await asyncio.sleep(self.rng.uniform(60.0, 900.0))
+        self.garden.mesh.weather = CLEAR
+
+    async def _cut(self) -> None:
+        source, target = self.rng.sample(self._nodes(), 2)
+        self.strike("one_way_cut", source, target)
+        self.garden.mesh.cut.add((source, target))
+        await asyncio.sleep(self.rng.uniform(3.0, 180.0))
+        self.garden.mesh.cut.discard((source, target))
+        self.touch(source, target)
+
+    async def _partition(self) -> None:
+        nodes = self._nodes()
+        side = set(self.rng.sample(nodes, self.rng.randint(1, len(nodes) - 1)))
+        links = [(a, b) for a in nodes for b in nodes if (a in side) != (b in side)]
+        self.strike("partition", *nodes)
+        self.garden.mesh.cut.update(links)
+        await asyncio.sleep(self.rng.uniform(3.0, 120.0))
+        self.rng.shuffle(links)
+        for link in links:
+            self.garden.mesh.cut.discard(link)
+            self.touch(*link)
+            await asyncio.sleep(self.rng.uniform(0.0, 2.0))
+        self.counts["healed_out_of_order"] += 1
+
+    async def _crash(self) -> None:
+        await self.crash(self.rng.choice(self._nodes()))
+
+    async def crash(self, name: str, kind: str = "") -> None:
+        """SIGKILL, or the power of a pot's machine, and a start some time later."""
+        if self.garden.running.get(name) is None:
+            return
+        family = self.garden.processes[name].kind
+        self.strike(kind or f"crash_{'brain' if family == 'robot' else 'pot' if family == 'plant' else family}", name)
+        self.garden.kill(name)
+        self.crashed(name)
+        if family == "robot":
+            self.halted(name)
+        elif self.rng.random() < 0.5:
+            self.counts["power_lost"] += 1
+            if self.garden.platters[name].lose_power(self.rng):
+                self.counts["unsynced_writes_lost"] += 1
+        await asyncio.sleep(self.rng.choice(DOWN_S))
+        self.touch(name)
+        if self.garden.running.get(name) is None:
+            self.garden.start(name)
+
+    async def _power_cycle(self) -> None:
+        """The whole robot goes dark: brain and body."""
+        robot_id = self.rng.choice(self.garden.names("robot"))
+        body = f"{robot_id}-body"
+        self.strike("crash_robot", robot_id)
+        for name in (robot_id, body):
+            self.garden.kill(name)
+        await asyncio.sleep(self.rng.choice(DOWN_S))
+        self.touch(robot_id)
+        for name in (body, robot_id):
+            if self.garden.running.get(name) is None:
+                self.garden.start(name)
+
+    async def _pause(self) -> None:
+        name = self.rng.choice(self._nodes())
+        running = self.garden.running.get(name)
+        if running is None or running.life.stopped:
+            return
+        seconds = self.rng.choice(PAUSE_S)
+        self.strike("pause_beyond_lease" if seconds > LEASE_S else "pause", name)
+        running.life.stopped = True
+        if running.process.kind == "robot":
+            self.halted(name)
+        await asyncio.sleep(seconds)
+        self.touch(name)
+        if running.life.stopped:
+            running.life.go_on()
+
+    async def _battery(self) -> None:
+        body = self.truth.look(self.rng.choice(self.garden.names("robot")))
+        if not body.dock:
+            self.strike("battery_empty", body.name)
+            body.battery_ratio = 0.0
+            self.truth.command(body.name, "stop")
+            await asyncio.sleep(self.rng.uniform(60.0, 600.0))
+            self._carry(body.name)
+        else:
+            self.strike("battery_low", body.name)
+            body.battery_ratio = self.rng.uniform(0.08, 0.2)
+
+    def _carry(self, robot_id: str) -> None:
+        """A person puts a full pack into a robot that is empty."""
+        body = self.truth.look(robot_id)
+        if body.battery_ratio <= 0.01:
+            body.battery_ratio = 0.6
+            self.touch(robot_id)
+
+    async def _pump(self) -> None:
+        body = self.truth.look(self.rng.choice(self.garden.names("robot")))
+        self.strike("pump_broken", body.name)
+        body.pump_broken = True
+        await asyncio.sleep(self.rng.uniform(60.0, 1200.0))
+        self.truth.look(body.name).pump_broken = False
+        self.touch(body.name)
+
+    async def _tap(self) -> None:
+        self.strike("water_out", "station")
+        self.truth.water_out = True
+        body = self.truth.look(self.rng.choice(self.garden.names("robot")))
+        body.tank_ml = min(body.tank_ml, self.rng.uniform(20.0, 120.0))
+        await asyncio.sleep(self.rng.uniform(120.0, 1200.0))
+        self.truth.water_out = False
+        self.touch("station", body.name)
+
+    async def _probe(self) -> None:
+        plant_id = self.rng.choice(self.garden.names("plant"))
+        self.strike("probe_silent", plant_id)
+        self.truth.pots[plant_id].probe_silent = True
+        await asyncio.sleep(self.rng.uniform(60.0, 900.0))
+        self.truth.pots[plant_id].probe_silent = False
+        self.touch(plant_id)
+
+    # At the disk
+
+    async def _arm_disk(self) -> None:
+        """The next write of somebody meets it."""
+        owners = [*self.garden.names("plant"), *self.garden.names("plant"), "station", *self.garden.names("body")]
+        self._disk[self.rng.choice(owners)] = self.rng.choice(DISK)
+
+    def _at_disk(self, running: Running, operation: str, path: Path) -> None:
+        name = running.process.name
+        if (kind := self._disk.get(name)) is None or operation == "read":
+            return
+        wanted = {
+            "crash_before_write": "create", "crash_in_write": "fsync_dir", "crash_after_write": "synced",
+            "disk_eio": "write", "disk_enospc": "create", "torn_write": "fsync", "fsync_error": "fsync",
+        }[kind]  # fmt: skip
+        if operation != wanted:
+            return
+        del self._disk[name]
+        self.strike(kind, name, running.process.keys)
+        if kind == "disk_eio":
+            raise OSError(errno.EIO, "input/output error")
+        if kind == "disk_enospc":
+            raise OSError(errno.ENOSPC, "no space left on device")
+        if kind == "fsync_error":
+            self._later(self._mend(name))
+            raise OSError(errno.EIO, "input/output error")
+        self._die_here(running, lose_power=kind in ("torn_write", "crash_in_write") or self.rng.random() < 0.5)
+
+    def _die_here(self, running: Running, *, lose_power: bool) -> None:
+        name = running.process.name
+        running.disk.dead = True
+        running.life.alive = False
+        if lose_power:
+            self.counts["power_lost"] += 1
+            if self.garden.platters[name].lose_power(self.rng):
+                self.counts["unsynced_writes_lost"] += 1
+        self._later(self._buried(name))
+        raise Died(name)
+
+    async def _buried(self, name: str) -> None:
+        """What is left of a process that died within a write is taken away, and it starts again later."""
+        self.garden.kill(name)
+        self.crashed(name)
+        robot_id = self.garden.processes[name].keys
+        if self.garden.processes[name].kind == "body":
+            self.garden.kill(robot_id)
+        await asyncio.sleep(self.rng.choice(DOWN_S))
+        for each in (name, robot_id):
+            self.touch(each)
+            if self.garden.running.get(each) is None:
+                self.garden.start(each)
+
+    async def _mend(self, name: str) -> None:
+        """Somebody reads the alarm, mends the disk and starts the service anew."""
+        await asyncio.sleep(MEND_AFTER_S)
+        self.touch(name, self.garden.processes[name].keys)
+        self.garden.kill(name)
+        self.crashed(name)
+        self.garden.start(name)
+
+    # At the worst instants
+
+    def _worst(self, message: Message, answer: Answer | None) -> bool:
+        if not self.on:
+            return False
+        kind = _named(message, answer)
+        if kind in WORST and self.rng.random() < WORST[kind]:
+            self.strike(kind, message.source, message.target)
+            return True
+        fatal = {"permit_reply_lost": "crash_after_permit", "award_reply_lost": "crash_after_award"}.get(kind, "")
+        if fatal and self.rng.random() < FATAL[fatal]:
+            self._later(self.crash(message.target if fatal == "crash_after_permit" else message.source, fatal))
+        if kind == "permit_reply_lost" and self.rng.random() < FATAL["death_before_act"]:
+            self._later(self.crash(message.source, "death_before_act"))
+        if kind == "end_report_lost" and self.rng.random() < FATAL["crash_on_end"]:
+            self._later(self.crash(message.target, "crash_on_end"))
+        return False
+
+    def _poured(self, dose: Dose) -> None:
+        if self.on and dose.ml > 1.0 and self.rng.random() < FATAL["death_after_act"]:
+            self._later(self.crash(dose.robot_id, "death_after_act"))
+
+    def _picked(self, robot_id: str, permit_id: str) -> None:
+        if self.on and self.rng.random() < FATAL["death_after_act"]:
+            self._later(self.crash(robot_id, "death_after_act"))
+
+    def _clock(self, name: str) -> NodeClock:
+        self.counts["clock_skew"] += 1
+        return skewed(self.rng)
+
+
+async def _await(work: Awaitable[None]) -> None:
+    await work
+
+
+def _named(message: Message, answer: Answer | None) -> str:
+    """The name under which this message is worth losing; empty for most."""
+    if message.method == "DELETE" and message.target.startswith("robot"):
+        return "kill_lost" if answer is None else ""
+    if message.method != "POST":
+        return ""
+    if message.path.endswith("/permits"):
+        return "permit_reply_lost" if answer is not None and answer.status == 200 else ""
+    if message.path == "/tasks" and message.target.startswith("robot"):
+        return "award_reply_lost" if answer is not None else ""
+    if message.path == "/inventory/scans":
+        return "scan_reply_lost" if answer is not None else ""
+    if message.path.endswith("/reports") and json.loads(message.body)["state"] in ("done", "failed"):
+        return "end_report_lost" if answer is None else "end_reply_lost"
+    return ""
+
+
+def _broken(running: Running) -> bool:
+    """A service whose disk failed it needs a person."""
+    if running.body is not None:
+        return bool(running.body.ledger.refusal(1.0).startswith("doses cannot"))
+    pot = getattr(running.app.state, "pot", None) if running.app is not None else None
+    return pot is not None and any("cannot be stored" in why for why in pot.ready())
