@@ -42,7 +42,8 @@ EYE_M = 0.06
 EYES_MAX = 24
 LONE_RATIO = 0.05
 """Of the circles of fruit, so few are the only one of a fruit that several views had in their pictures (counted with two
-detectors: 0 of 70 and 2 of 130). False circles nearly all stand alone, so one view alone is weak evidence of a new fruit."""
+detectors: 0 of 70 and 2 of 130). False circles nearly all stand alone, so one view alone is weak evidence of a new fruit,
+and so is the edge of the only picture that could show it."""
 ODDS_MISSED_MIN = -2.5
 """One scan alone does not count for more against a fruit: branches move."""
 FLOOR = 0.20
@@ -186,11 +187,16 @@ def _sights(track: Track, scan: Scan, others: Sequence[Track]) -> list[float]:
     """For each view that had the fruit in its picture: the chance that nothing was in between."""
     chances = []
     for view in scan.views:
-        if in_view(view, track.p) and not blocked(view, track, others):
-            eye = _eye(track.eyes, view)
+        eye = _eye(track.eyes, view)
+        if _shows(view, track.p, eye) and not blocked(view, track, others):
             seen, looks = (eye.seen, eye.looks) if eye is not None else (0, 0)
             chances.append((SEEN_PRIOR + seen) / (SEEN_PRIOR + UNSEEN_PRIOR + looks))
     return chances
+
+
+def _shows(view: View, p: tuple[float, float, float], eye: Eye | None) -> bool:
+    """Whether it should be in the picture: well inside, or at its edge where it was seen from here before."""
+    return in_view(view, p) or (eye is not None and eye.seen > 0)
 
 
 def _eye(eyes: Sequence[Eye], view: View) -> Eye | None:
@@ -203,10 +209,11 @@ def _looked(track: Track, views: Sequence[View], seen_in: Sequence[int]) -> list
     """The directions after a scan that saw the fruit in some views and not in others."""
     eyes = list(track.eyes)
     for index, view in enumerate(views):
-        if index not in seen_in and not in_view(view, track.p):
+        eye = _eye(eyes, view)
+        if index not in seen_in and not _shows(view, track.p, eye):
             continue
         seen = int(index in seen_in)
-        if (eye := _eye(eyes, view)) is None:
+        if eye is None:
             eyes.append(Eye(place=Place(x_m=view.x_m, y_m=view.y_m, z_m=view.z_m), looks=1, seen=seen))
         else:
             eyes[eyes.index(eye)] = eye.model_copy(update={"looks": eye.looks + 1, "seen": eye.seen + seen})
@@ -288,7 +295,8 @@ def _fresh(fruit_id: str, sighting: Sighting, scan: Scan, now_s: float) -> Track
     unseen = [view for index, view in enumerate(scan.views) if index not in sighting.views and in_view(view, track.p)]
     chance = SEEN_PRIOR / (SEEN_PRIOR + UNSEEN_PRIOR)
     odds = _evidence(sighting, scan.detector) + _against([chance] * len(unseen), scan.detector)
-    if unseen and len(sighting.views) == 1:
+    alone = len(sighting.views) == 1
+    if alone and (unseen or not in_view(scan.views[sighting.views[0]], track.p)):
         odds += math.log(LONE_RATIO)
     eyes = _looked(track, scan.views, sighting.views)
     return track.with_fruit(confidence=probability(odds)).model_copy(update={"eyes": eyes})

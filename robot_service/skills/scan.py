@@ -24,8 +24,6 @@ RANGE_M_MAX = 0.9
 RANGE_M_MIN = 0.08
 PLANT_RADIUS_M, PLANT_M = 0.27, (0.02, 1.3)
 """The room that a plant takes: round its stem, above its soil."""
-MARGIN_RATIO = 0.9
-"""Only what lies this far inside the picture counts as seen or missed: at the edge a fruit is cut."""
 
 
 async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Scan:
@@ -63,8 +61,7 @@ async def _go(robot: Robot, q: tuple[float, float, float, float]) -> None:
 def document(robot: Robot, plant: PlantCard, scan_id: str, task_id: str, views: list[ScanView], seen: list[Seen]) -> Scan:
     """The scan as the plant takes it; the surest fruit if there are more than it takes."""
     camera, pose = robot.eye.camera, base_in_plant(robot.pose(), plant)
-    half_x = math.atan(MARGIN_RATIO * camera.width / 2 / camera.fx)
-    half_y = math.atan(MARGIN_RATIO * camera.height / 2 / camera.fy)
+    half_x, half_y = math.atan(camera.width / 2 / camera.fx), math.atan(camera.height / 2 / camera.fy)
     best = sorted(filter(_on_the_plant, seen), key=lambda fruit: -fruit.confidence)[:FRUITS_MAX]
     return Scan(
         scan_id=scan_id,

@@ -15,6 +15,7 @@ from core.growth.stages import COLOURS, DAY_S
 from core.inventory.ledger import FLOOR, Merged, merge
 from core.inventory.matching import assign
 from core.inventory.track import Track
+from core.inventory.view import in_view
 from core.wire.fruit import Accuracy, Colour, Direction, Scan, Sighting, View
 
 EYES = [(0.45, y, z) for z in (0.12, 0.32) for y in (-0.15, 0.0, 0.15)]
@@ -280,3 +281,14 @@ def test_a_fruit_that_two_views_show_counts_at_once():
     plant = Plant([shown], random.Random(5))
     plant.scan()
     assert plant.of(shown).fruit.confidence > 0.8
+
+
+def test_what_one_picture_shows_at_its_edge_is_doubted_and_goes_when_it_is_not_seen_there_again() -> None:
+    places = [(0.05, y / 100, z / 100) for y in range(-60, 61) for z in range(-10, 60)]
+    edge = next(p for p in places if not any(in_view(view(eye), p) for eye in EYES))
+    plant = Plant([Tomato(edge, hidden=frozenset(range(1, 6)))], random.Random(6))
+    plant.scan()
+    assert plant.tracks[0].fruit.confidence < 0.5
+    plant.fruit = []
+    left = [entry for _ in range(3) for entry in plant.scan().left]
+    assert [entry.fruit_id for entry in left] == ["f1"]
