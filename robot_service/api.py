@@ -59,8 +59,12 @@ def _market(app: FastAPI, brain: Brain) -> None:
         return queued(brain.queue.get(task_id))
 
     @app.delete("/tasks/{task_id:path}", summary="Kill task", tags=["market"])
-    async def kill(task_id: Id, caller: Caller = allow("plant", "operator")) -> QueuedTask:
-        return brain.kill(task_id, caller)
+    async def kill(
+        task_id: Id,
+        caller: Caller = allow("plant", "operator"),
+        epoch: Annotated[int | None, Query(ge=0, le=2**53, description="only if it is held under this epoch")] = None,
+    ) -> QueuedTask:
+        return brain.kill(task_id, caller, epoch)
 
 
 def _readings(app: FastAPI, brain: Brain) -> None:

@@ -11,7 +11,7 @@ from core.allocation.bidding import Condition, Stop, price, work_s
 from core.allocation.epochs import owner_of
 from core.allocation.queue import Entry, TaskQueue
 from core.clock import Clock
-from core.errors import Forbidden, Unavailable, Unprocessable
+from core.errors import Forbidden, Refused, Unavailable, Unprocessable
 from core.geometry.pinhole import from_fov
 from core.mesh.auth import Caller, Identity, Verifier
 from core.mesh.client import Mesh, PeerTransport
@@ -245,12 +245,14 @@ class Brain:
         self.reporter.soon()
         return queued(entry)
 
-    def kill(self, task_id: str, caller: Caller) -> QueuedTask:
-        """Kill task; a plant only its own."""
+    def kill(self, task_id: str, caller: Caller, epoch: int | None = None) -> QueuedTask:
+        """Kill task; a plant only its own. Raises Refused for an epoch that is over: that word came late."""
         entry = self.queue.get(task_id)
         if caller.role == "plant" and caller.subject != entry.plant_id:
             owner = entry.plant_id or self.settings.id
             raise Forbidden(f"{task_id} is a task of {owner}", hint=f"only {owner} or an operator kills it")
+        if epoch is not None and epoch != entry.epoch:
+            raise Refused(f"{task_id} is held under epoch {entry.epoch}, not {epoch}", hint="kill the epoch that is meant")
         self.scheduler.kill(entry, f"killed by {caller.subject}")
         return queued(entry)
 

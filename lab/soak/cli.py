@@ -41,12 +41,13 @@ def soak_command(
     first: Annotated[
         int, typer.Option("--first", "--seed", min=0, help="The first garden's seed; the others follow")
     ] = FIRST,
+    hurry: Annotated[float, typer.Option(min=0.1, max=20, help="How much more often things are asked and go wrong")] = 1.0,
     jobs: Annotated[int, typer.Option(min=0, help="Processes; 0: one a core")] = 0,
     as_one_json: Annotated[bool, typer.Option("--json", help="Print one JSON document")] = False,
 ) -> None:
     """Live through whole gardens with faults on virtual time and judge every invariant. Exit 1 when one broke."""
     tell = Console(stderr=True)
-    plans = [Plan(seed=seed, days=days) for seed in range(first, first + seeds)]
+    plans = [Plan(seed=seed, days=days, hurry=hurry) for seed in range(first, first + seeds)]
     ended = 0
 
     def told(outcome: Outcome) -> None:
@@ -74,4 +75,4 @@ def _lines(outcome: Outcome) -> Iterator[str]:
         yield f"  {breach.invariant} at {breach.at_s:.1f} s: {breach.what}"
         yield from (f"      {line}" for line in breach.story)
     if outcome.breaches:
-        yield f"  replay: {Plan(seed=outcome.seed, days=outcome.days).replay()}"
+        yield f"  replay: {outcome.plan.replay()}"

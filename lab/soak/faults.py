@@ -25,6 +25,7 @@ LEASE_S = 8.0
 DOWN_S = (0.5, 4.0, 20.0, 90.0)
 """How long a dead process stays dead: shorter and longer than leases, permits and a pot's patience."""
 PAUSE_S = (0.4, 3.0, 12.0, 40.0)
+FAULT_EVERY_S = 240.0
 CALM_EVERY_S, CALM_S = 3 * 3600.0, 2400.0
 """So often everything is mended and left alone for so long: what does not come right then never does."""
 STORMS = (
@@ -41,7 +42,7 @@ WORST = {
 """Chance that just this message is lost, while faults are on."""
 FATAL = {
     "death_after_act": 0.10, "death_before_act": 0.05, "crash_after_permit": 0.05, "crash_after_award": 0.05,
-    "crash_on_end": 0.05,
+    "crash_on_end": 0.05, "crash_writing_award": 0.06, "crash_writing_permit": 0.10, "pause_under_permit": 0.04,
 }  # fmt: skip
 """Chance that a process dies at this instant."""
 DISK = ("crash_before_write", "crash_in_write", "crash_after_write", "disk_eio", "disk_enospc", "torn_write", "fsync_error")
@@ -91,13 +92,13 @@ class Gremlin:
 
     # At random
 
-    async def run(self) -> None:
+    async def run(self, hurry: float) -> None:
         """Faults for a while, then calm, for ever."""
         while True:
             self.on = True
             until_s = self.truth.now() + CALM_EVERY_S - CALM_S
             while self.truth.now() < until_s:
-                await asyncio.sleep(self.rng.expovariate(1 / 240.0))
+                await asyncio.sleep(self.rng.expovariate(hurry / FAULT_EVERY_S))
                 await self._one()
             self.heal_all()
             await asyncio.sleep(CALM_S)
@@ -204,8 +205,8 @@ class Gremlin:
             if self.garden.running.get(name) is None:
                 self.garden.start(name)
 
-    async def _pause(self) -> None:
-        name = self.rng.choice(self._nodes())
+    async def _pause(self, name: str = "") -> None:
+        name = name or self.rng.choice(self._nodes())
         running = self.garden.running.get(name)
         if running is None or running.life.stopped:
             return
@@ -329,6 +330,7 @@ class Gremlin:
         if not self.on:
             return False
         kind = _named(message, answer)
+        self._at_the_worst(message, answer)
         if kind in WORST and self.rng.random() < WORST[kind]:
             self.strike(kind, message.source, message.target)
             return True
@@ -340,6 +342,21 @@ class Gremlin:
         if kind == "end_report_lost" and self.rng.random() < FATAL["crash_on_end"]:
             self._later(self.crash(message.target, "crash_on_end"))
         return False
+
+    def _at_the_worst(self, message: Message, answer: Answer | None) -> None:
+        """A pot dies while it writes an award or a permit; a brain sleeps with a fresh permit."""
+        if message.path == "/bids" and answer is not None and self.rng.random() < FATAL["crash_writing_award"]:
+            self._arm("crash_writing_award", message.source)
+        if message.path.endswith("/permits") and answer is None and self.rng.random() < FATAL["crash_writing_permit"]:
+            self._arm("crash_writing_permit", message.target)
+        if message.path.endswith("/permits") and answer is not None and self.rng.random() < FATAL["pause_under_permit"]:
+            self.counts["pause_under_permit"] += 1
+            self._later(self._pause(message.source))
+
+    def _arm(self, why: str, name: str) -> None:
+        """Whatever this pot writes next is the last that it does."""
+        self.counts[why] += 1
+        self._disk[name] = self.rng.choice(("crash_before_write", "crash_in_write", "crash_after_write"))
 
     def _poured(self, dose: Dose) -> None:
         if self.on and dose.ml > 1.0 and self.rng.random() < FATAL["death_after_act"]:

@@ -45,7 +45,7 @@ from robot_service.settings import RobotSettings
 
 COARSE = {
     "robot_service.robot": {"TICK_S": 0.2},
-    "robot_service.body.body": {"DT_S": 0.2, "LONG_REST_DT_S": 60.0},
+    "robot_service.body.body": {"DT_S": 0.2, "LONG_REST_S": 10.0, "LONG_REST_DT_S": 60.0},
     "robot_service.docks": {"REST_FOR_S": 240.0, "RENEW_RESTING_S": 180.0},
     "robot_service.neighbours": {"IDLE_EVERY_S": 120.0},
 }
@@ -121,6 +121,7 @@ class SoakGarden:
         self.urls = {peer.id: peer.url for peer in self.peers}
         self._markers = {n: (p.x_m, p.y_m, p.yaw_rad) for n, p in ceiling_markers(map_of(scenario).arena).items()}
         self._boots: Counter[str] = Counter()
+        self._dying: dict[str, asyncio.Task[None]] = {}
 
     def names(self, kind: str) -> list[str]:
         return [process.name for process in self.processes.values() if process.kind == kind]
@@ -163,6 +164,8 @@ class SoakGarden:
         if running is None:
             return
         running.disk.dead = True
+        if running.task is not None:
+            self._dying[name] = running.task
         for link in running.links:
             link.cut()
         if running.process.kind == "body":
@@ -177,6 +180,9 @@ class SoakGarden:
             self.hooks.died(name, error)
 
     async def _live(self, running: Running) -> None:
+        if (before := self._dying.pop(running.process.name, None)) is not None:
+            # The system takes a dead process's locks away at once; here its last tasks must have ended.
+            await asyncio.wait([before])
         async with asyncio.TaskGroup() as group:
             for loop in self._build(running):
                 group.create_task(_run(loop))

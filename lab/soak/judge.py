@@ -119,6 +119,7 @@ class Judge:
         self._boot: defaultdict[str, int] = defaultdict(int)
         self._stopped: set[str] = set()
         self._apart: dict[tuple[str, str, int], float] = {}
+        self._documents: dict[str, MarketDocument] = {}
         self._limits = Limits()
 
     def attach(self, garden: SoakGarden) -> None:
@@ -241,6 +242,9 @@ class Judge:
         """I4: what left a node as a promise."""
         if answer.status == 500:
             self.breach("I4", f"{message.target} answered 500 to {message.method} {message.path}")
+        if answer.status in (400, 405, 422) and message.source != "operator":
+            route = f"{message.method} {message.path.partition('?')[0]}"
+            self.breach("I7", f"{message.target} does not understand {route} of {message.source}")
         if answer.status >= 300 or message.method == "GET":
             return
         if message.path.endswith("/permits"):
@@ -268,6 +272,10 @@ class Judge:
         said, wish, now_s = json.loads(answer.body), json.loads(message.body), self.truth.now()
         if said["permit_id"] in self._permits:
             return
+        epoch = max((e for task_id, e in self._awards if task_id == said["task_id"]), default=-1)
+        if said["epoch"] < epoch or self._awards.get((said["task_id"], epoch)) != message.source:
+            holder = self._awards.get((said["task_id"], epoch), "nobody")
+            self.breach("I1", f"{said['task_id']} is {holder}'s, epoch {epoch}, and {message.source} got a permit")
         asked_s = self._permit_asked.get((message.path, message.source, f"{wish['epoch']}/{wish['fruit_id']}"), now_s)
         permit = _Permit(
             said["permit_id"], said["task_id"], message.source, message.target, said["act"], said["epoch"], said["dose_ml"],
@@ -300,11 +308,15 @@ class Judge:
             pot = self.garden.pot(plant_id)
             if pot is None or (document := pot.place._keeper.durable) is None:
                 continue
-            self._document(plant_id, document)
+            known = self._documents.get(plant_id) is document
+            self._documents[plant_id] = document
+            if not known:
+                self._document(plant_id, document)
             self._fruits(plant_id)
             for task in document.tasks:
-                self._task(plant_id, task)
-                self._agree(plant_id, task, entries)
+                if not known or task.state not in FINAL_STATES:
+                    self._task(plant_id, task)
+                    self._agree(plant_id, task, entries)
         for robot_id, held in entries.items():
             self._queue(robot_id, held)
 

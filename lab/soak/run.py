@@ -26,7 +26,8 @@ from lab.soak.life import Life, SoakLoop
 from lab.soak.world import Dose, Truth
 
 DAY_S = 86400.0
-END_CALM_S = 3600.0
+END_CALM_S = 2400.0
+ASK_EVERY_S = 900.0
 MEMORY = Path("/dev/shm")
 SIZES = ((1, 1), (2, 1), (2, 2), (3, 2), (3, 2), (4, 2))
 """Pots and robots of a garden; the seed chooses."""
@@ -38,10 +39,15 @@ class Plan:
 
     seed: int
     days: float
+    hurry: float = 1.0
+    """How much more often something is asked for and goes wrong."""
     faults: bool = True
+    one_breach: bool = False
+    """End at the first broken invariant."""
 
     def replay(self) -> str:
-        return f"garden soak --days {self.days:g} --seeds 1 --seed {self.seed}"
+        hurry = f" --hurry {self.hurry:g}" if self.hurry != 1.0 else ""
+        return f"garden soak --days {self.days:g}{hurry} --seeds 1 --seed {self.seed}"
 
 
 @dataclass(slots=True)
@@ -49,7 +55,7 @@ class Outcome:
     """What became of one garden."""
 
     seed: int
-    days: float
+    plan: Plan
     tally: Tally = field(default_factory=Tally)
     faults: dict[str, int] = field(default_factory=dict)
     breaches: list[Breach] = field(default_factory=list)
@@ -106,19 +112,24 @@ async def _soak(plan: Plan, folder: Path, told: Callable[[float], None]) -> Outc
     judge.attach(garden)
     garden.start_all()
     await asyncio.sleep(30.0)
-    people = People(garden, judge, gremlin, random.Random(rng.random()))
+    people = People(garden, judge, gremlin, random.Random(rng.random()), plan.hurry)
     jobs = [asyncio.ensure_future(judge.watch()), asyncio.ensure_future(people.run())]
     if plan.faults:
-        jobs.append(asyncio.ensure_future(gremlin.run()))
+        jobs.append(asyncio.ensure_future(gremlin.run(plan.hurry)))
     jobs.append(asyncio.ensure_future(_calms(judge)))
-    await _through(plan.days * DAY_S, jobs, told)
+
+    def stop() -> bool:
+        return plan.one_breach and bool(judge.breaches)
+
+    await _through(plan.days * DAY_S, jobs, told, stop)
     for job in jobs[1:]:
         job.cancel()
     gremlin.heal_all()
-    await people.mend()
-    await asyncio.sleep(END_CALM_S)
-    judge.look()
-    judge.drained()
+    if not stop():
+        await people.mend()
+        await asyncio.sleep(END_CALM_S)
+        judge.look()
+        judge.drained()
     jobs[0].cancel()
     judge.tally.doses, judge.tally.picks, judge.tally.requests = len(truth.doses), truth.picks, garden.mesh.requests
     for name in list(garden.running):
@@ -126,17 +137,21 @@ async def _soak(plan: Plan, folder: Path, told: Callable[[float], None]) -> Outc
     with suppress(asyncio.CancelledError):
         await asyncio.sleep(1.0)
     trace = f"{judge.tally.requests}/{truth.now():.6f}/{sum(d.ml for d in truth.doses):.6f}/{truth.picks}"
-    return Outcome(plan.seed, plan.days, judge.tally, dict(sorted(counts.items())), judge.breaches, trace)
+    return Outcome(plan.seed, plan, judge.tally, dict(sorted(counts.items())), judge.breaches, trace)
 
 
-async def _through(seconds: float, jobs: list[asyncio.Task[None]], told: Callable[[float], None]) -> None:
-    """Let the days pass; whatever a job of ours dies of is raised."""
+async def _through(
+    seconds: float, jobs: list[asyncio.Task[None]], told: Callable[[float], None], stop: Callable[[], bool]
+) -> None:
+    """Let the days pass, or until `stop`; whatever a job of ours dies of is raised."""
     for step in range(100):
         await asyncio.sleep(seconds / 100)
         told((step + 1) / 100)
         for job in jobs:
             if job.done():
                 job.result()
+        if stop():
+            return
 
 
 async def _calms(judge: Judge) -> None:
@@ -163,14 +178,14 @@ def _told(error: BaseException) -> str:
 class People:
     """Somebody who asks for this and that, presses the e-stop and changes his mind."""
 
-    def __init__(self, garden: SoakGarden, judge: Judge, gremlin: Gremlin, rng: random.Random) -> None:
-        self._garden, self._judge, self._gremlin, self._rng = garden, judge, gremlin, rng
+    def __init__(self, garden: SoakGarden, judge: Judge, gremlin: Gremlin, rng: random.Random, hurry: float) -> None:
+        self._garden, self._judge, self._gremlin, self._rng, self._hurry = garden, judge, gremlin, rng, hurry
         self._life, self._number = Life("operator"), 0
         self._transport = garden.mesh.transport(self._life)
 
     async def run(self) -> None:
         while True:
-            await asyncio.sleep(self._rng.expovariate(1 / 900.0))
+            await asyncio.sleep(self._rng.expovariate(self._hurry / ASK_EVERY_S))
             await self._rng.choice((self._ask, self._ask, self._ask, self._ask, self._change, self._cancel, self._stop))()
 
     async def _ask(self) -> None:
@@ -232,7 +247,7 @@ def as_json(outcomes: list[Outcome]) -> dict[str, object]:
         faults.update(outcome.faults)
     broken = [b for outcome in outcomes for b in outcome.breaches]
     return {
-        "simulated_days": round(sum(o.days for o in outcomes), 3),
+        "simulated_days": round(sum(o.plan.days for o in outcomes), 3),
         "seeds": len(outcomes),
         "tasks": sum(o.tally.tasks for o in outcomes),
         "done": sum(o.tally.done for o in outcomes),
@@ -242,5 +257,5 @@ def as_json(outcomes: list[Outcome]) -> dict[str, object]:
         "faults": dict(sorted(faults.items())),
         "broken_invariants": len(broken),
         "broken": [{"seed": o.seed, **asdict(b)} for o in outcomes for b in o.breaches],
-        "replay": [Plan(seed=o.seed, days=o.days).replay() for o in outcomes if o.breaches],
+        "replay": [o.plan.replay() for o in outcomes if o.breaches],
     }

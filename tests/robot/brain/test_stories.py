@@ -62,6 +62,20 @@ def test_two_awards_are_done_one_after_the_other_and_both_leases_are_kept():
     in_garden(story)
 
 
+def test_a_kill_ends_the_epoch_it_names_and_no_later_one():
+    async def story(garden):
+        await garden.award("plant-3", epoch=1)
+        await garden.award("plant-3", epoch=2)
+        late = await garden.call("robot-1", "DELETE", "/tasks/plant-3:1?epoch=1", as_="plant-3")
+        assert late.status_code == 409
+        assert garden.brains["robot-1"].queue.entries
+        meant = await garden.call("robot-1", "DELETE", "/tasks/plant-3:1?epoch=2", as_="plant-3")
+        assert meant.status_code == 200
+        await garden.until(lambda: not garden.brains["robot-1"].queue.entries, 2.0)
+
+    in_garden(story)
+
+
 def test_a_task_killed_on_the_way_is_dropped_and_the_robot_goes_home_without_pouring():
     async def story(garden):
         await garden.award("plant-3")

@@ -1,0 +1,48 @@
+"""A test of the tests: every mistake of `bugs` must be found by the soak, soon."""
+
+import importlib.util
+from pathlib import Path
+from statistics import median
+
+import pytest
+
+from lab.soak.run import Plan, soak
+
+_spec = importlib.util.spec_from_file_location("soak_bugs", Path(__file__).with_name("bugs.py"))
+assert _spec is not None
+assert _spec.loader is not None
+bugs = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(bugs)
+
+SEEDS_MAX = 200
+QUICK = ("acknowledged_before_fsync", "an_award_is_queued_again", "the_wall_clock_is_used")
+"""Found by the first seeds: these run in every test."""
+
+
+def seeds_until_found(name, seeds_max=SEEDS_MAX):
+    """How many gardens are needed, and the invariant that broke; None when none of them found it."""
+    for seed in range(1, seeds_max + 1):
+        with bugs.BUGS[name]():
+            outcome = soak(Plan(seed=seed, days=0.05, hurry=3.0, one_breach=True))
+        if outcome.breaches:
+            return seed, outcome.breaches[0]
+    return None
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_plain_mistake_is_found_by_the_first_seeds(name):
+    found = seeds_until_found(name, 3)
+    assert found is not None
+    print(name, *found)
+
+
+@pytest.mark.soak
+def test_every_planted_bug_is_found_within_200_seeds():
+    needed = {}
+    for name in bugs.BUGS:
+        found = seeds_until_found(name)
+        assert found is not None, f"{name} was not found by {SEEDS_MAX} seeds"
+        needed[name] = found[0]
+        print(f"{name}: seed {found[0]}, {found[1].invariant} {found[1].what}")
+    print(f"median {median(needed.values())} of {len(needed)}")
+    assert len(needed) >= 12
