@@ -19,15 +19,17 @@ from core.robots.gardener import GRIPPER_OPEN_M, HAND_M, SHOULDER_X_M
 
 LOOK_M = 0.12
 """Tool point short of the fruit while the servo looks: from nearer the eye, which sits above the fingers, loses it."""
+BACK_M = 0.20
+"""Tool point short of the fruit, as far as the arm can, where the hand may swing aside without touching the plant."""
 READY_M = 0.05
 """Tool point short of the fruit before the last, straight advance."""
 RETREAT_M = 0.09
 """Straight back with the fruit, until nothing hangs between the fingers and the plant."""
 STEP_M = 0.015
-OPENING_SLACK_M = 0.006
+OPENING_SLACK_M = 0.004
 """The fingers open this much wider than the fruit on either side: room for error, none for its neighbour."""
 PITCHES_RAD = tuple(math.radians(d) for d in range(-54, 73, 6))
-ROLLS_RAD = tuple(math.radians(d) for d in (0, 30, -30, 60, -60, 90))
+ROLLS_RAD = tuple(math.radians(d) for d in (0, 20, -20, 40, -40, 60, -60, 80, -80, 90))
 """For a wrist that rolls."""
 ROOM_M_MIN = -0.004
 """A fruit gives way by so much on its stalk and slides along the finger; with less room the hand stays away."""
@@ -71,6 +73,8 @@ class Approach:
     opening_m: float
     roll_rad: float
     path: tuple[Joints, ...]
+    back: Joints
+    """Further back on the same line: from there the hand comes in."""
     room_m: float
     """Between the hand and the nearest neighbour; negative when it would be pushed."""
 
@@ -151,12 +155,37 @@ def approaches(
         except Refused as refusal:
             why = why or refusal
             continue
-        rooms = {roll: room_m(fruit, pitch_rad, opening_m, others, roll) for roll in rolls_rad}
-        roll = max(rolls_rad, key=lambda turn: (min(rooms[turn], ROOM_ENOUGH_M), -abs(turn)))
-        found.append(Approach(pitch_rad=pitch_rad, opening_m=opening_m, roll_rad=roll, path=path, room_m=rooms[roll]))
+        roll, room = roomiest(fruit, pitch_rad, opening_m, others, rolls_rad)
+        back = _furthest_back(fruit, pitch_rad)
+        found.append(
+            Approach(pitch_rad=pitch_rad, opening_m=opening_m, roll_rad=roll, path=path, back=back or path[0], room_m=room)
+        )
     if not found:
         raise Refused(f"no way of the hand to the fruit: {why}", hint="another dock or robot may reach it")
     return sorted(found, key=lambda a: (-min(a.room_m, ROOM_ENOUGH_M), abs(a.pitch_rad)))
+
+
+def roomiest(
+    fruit: Point3, pitch_rad: float, opening_m: float, others: Sequence[Obstacle], rolls_rad: Sequence[float]
+) -> tuple[float, float]:
+    """The roll [rad] of the fingers with the most room, the least of equals, and that room [m]."""
+    rooms = {roll: room_m(fruit, pitch_rad, opening_m, others, roll) for roll in rolls_rad}
+    roll = max(rolls_rad, key=lambda turn: (min(rooms[turn], ROOM_ENOUGH_M), -abs(turn)))
+    return roll, rooms[roll]
+
+
+def _furthest_back(fruit: Point3, pitch_rad: float) -> Joints | None:
+    """Joints up to `BACK_M` before the fruit, straight behind the looking pose; None when there are none."""
+    found: Joints | None = None
+    for step in range(1, round((BACK_M - LOOK_M) / STEP_M) + 1):
+        try:
+            q = inverse(along(fruit, pitch_rad, LOOK_M + step * STEP_M), pitch_rad)
+        except Refused:
+            break
+        if singular(q) or obstruction(q):
+            break
+        found = q
+    return found
 
 
 def travel_rad(path: Sequence[Joints]) -> float:

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from core.errors import Refused, Unprocessable
+from core.inventory.matching import assign
+from core.inventory.sightings import lift_fixed_radius
 from core.manipulation.approach import (
     READY_M,
     RETREAT_M,
@@ -22,13 +24,13 @@ from core.manipulation.approach import (
     Obstacle,
     along,
     approaches,
-    room_m,
+    roomiest,
     way_in,
 )
 from core.manipulation.arm import Joints, Point3, inverse
 from core.manipulation.eye import camera_pose
 from core.manipulation.kinematics import Array
-from core.manipulation.servo import GATE_CHI2, Target, interaction_matrix, servo_step
+from core.manipulation.servo import FRUIT_RADIUS_M, GATE_CHI2, Target, interaction_matrix, servo_step
 from core.manipulation.swing import Leg, leg_s, swing
 from core.perception.detection import Detection
 from core.robots import gardener
@@ -57,11 +59,18 @@ NEAR_SIDE_M, NEAR_DEPTH_M = 0.004, 0.008
 FAR_OFF_M, FAR_OFF_SIGMAS = 0.016, 1.5
 """A fruit further than this from where the inventory has it, or than so many of its standard deviations beyond, is another
 one: neighbours hang two to four centimetres apart."""
+OPPOSITE = {"red": "green", "green": "red"}
+"""No detector takes one of these for the other; turning goes for both."""
+STRANGE_RATIO = 0.6
+"""A circle whose centre is further from all others than this part of both radii is a fruit of its own."""
+STRANGER_SIGMA_M = 0.015
 HELD_N = 0.8
 """Squeeze above which something is between the fingers."""
 GRIP_N_MAX = 9.0
 CLOSE_S = 0.6
-GRASPS_MAX = 2
+DEEPER_M = (0.003, 0.013)
+"""How far beyond the fruit's middle the fingers close, at the first grasp and at the next: a fruit that hangs nearer than it
+was thought slides further in between them, one that hangs further off is not reached."""
 FAST_SHARE, ADVANCE_SHARE, PULL_SHARE = 0.5, 0.2, 0.15
 """Of a servo's top speed: through the air, in among the fruit, and with one in hand."""
 TWIST_RAD = 0.30
@@ -82,6 +91,14 @@ class Task:
     plant: PlantCard
     take_permit: TakePermit
     keep_picture: KeepPicture
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbour:
+    """A fruit that is not wanted now: what is known of it, better with every picture."""
+
+    target: Target
+    colour: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,41 +202,56 @@ async def _pick(task: Task, fruit: Fruit, others: Sequence[Fruit], ways: Ways) -
                 break
             return Pick(fruit_id=fruit.fruit_id, outcome="unreachable", reason=str(ways)[:500])
         roomy = [way for way in ways if way.room_m >= ROOM_M_MIN]
-        if not roomy:
-            return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason="other fruit hangs in the way of the hand")
+        why = why if roomy else "other fruit hangs in the way of the hand"
         for way in roomy[:WAYS_MAX]:
-            target, near = _expected(task, fruit), [_expected(task, other) for other in others]
+            target, near = _expected(task, fruit), [Neighbour(_expected(task, o), o.colour) for o in others]
             try:
-                await _swing(task.robot, way.look, Grip(way.opening_m, way.roll_rad))
+                await _swing_before(task.robot, way)
                 why = await servo(task.robot, way.pitch_rad, target, fruit, _place(task, fruit), near)
             except Refused as error:
                 why = reason_unless_halted(error)
-            if not why and not _room_to(way, target, near):
-                why = "seen from near, other fruit hangs in the way of the hand"
             if not why:
-                return await _take(task, fruit, way, target)
+                turned = _turned(task.robot, way, target, near)
+                if turned.room_m >= ROOM_M_MIN:
+                    return await _take(task, fruit, turned, target, near)
+                why = "seen from near, other fruit hangs in the way of the hand"
     why = f"looked from {PLACES_MAX} places and several sides: {why}"
     return Pick(fruit_id=fruit.fruit_id, outcome="failed", reason=why[:500])
 
 
-def _room_to(way: Approach, target: Target, near: Sequence[Target]) -> bool:
-    """Whether the hand may go on, by what was seen of the neighbours on the way."""
-    others = [Obstacle(centre=_point(other.p_base), radius_m=other.radius_m) for other in near]
-    return room_m(_point(target.p_base), way.pitch_rad, way.opening_m, others, way.roll_rad) >= ROOM_M_MIN
+def _turned(robot: Robot, way: Approach, target: Target, near: Sequence[Neighbour]) -> Approach:
+    """The way with the fingers turned as is best by what was seen on it of the fruit and its neighbours."""
+    fruit = _point(target.p_base)
+    others = [Obstacle(centre=_point(other.target.p_base), radius_m=other.target.radius_m) for other in near]
+    roll_rad, room_m = roomiest(fruit, way.pitch_rad, way.opening_m, others, _rolls(robot))
+    return replace(way, roll_rad=roll_rad, room_m=room_m)
 
 
-def _learn_neighbours(robot: Robot, look: Look, mine: Detection, target: Target, near: Sequence[Target], T: Array) -> None:
-    """The other circles belong to the neighbours; what all of them share is the error of the base's own pose."""
-    shift = target.p_base - target.expected_p
-    free = [circle for circle in look.detections if circle is not mine]
-    for other in near:
-        guess = replace(other, p_base=other.p_base + (shift if other.sightings == 0 else 0.0))
-        scored = [(_distance2(robot, guess, circle, T), index) for index, circle in enumerate(free)]
-        distance2, index = min(scored, default=(math.inf, -1))
-        if distance2 < GATE_CHI2:
-            circle = free.pop(index)
-            other.p_base = guess.p_base
-            other.see(robot.eye.camera, T, circle.features)
+def _told_apart(
+    robot: Robot, circles: Sequence[Detection], target: Target, colour: str, near: Sequence[Neighbour], T_base_cam: Array
+) -> dict[int, Detection]:
+    """Which circle is the target's (0) and which its neighbours' (1, 2, ...): the likeliest for all of them together."""
+    hanging = [(target, colour), *((other.target, other.colour) for other in near)]
+    costs = {
+        (row, column): _distance2(robot, known, circle, T_base_cam)
+        for row, (known, its_colour) in enumerate(hanging)
+        for column, circle in enumerate(circles)
+        if circle.colour != OPPOSITE.get(its_colour)
+    }
+    return {row: circles[column] for row, column in assign(costs, len(hanging), GATE_CHI2).items()}
+
+
+def _learn(robot: Robot, circles: Sequence[Detection], mine: dict[int, Detection], near: list[Neighbour], T: Array) -> None:
+    """Take what was seen of the neighbours into account; circles that belong to no known fruit are neighbours too."""
+    camera = robot.eye.camera
+    for row, circle in mine.items():
+        if row > 0:
+            near[row - 1].target.see(camera, T, circle.features)
+    known = [(circle.u_px, circle.v_px, circle.radius_px) for circle in mine.values()]
+    for circle in circles:
+        if all(math.hypot(circle.u_px - u, circle.v_px - v) > STRANGE_RATIO * (circle.radius_px + r) for u, v, r in known):
+            p = lift_fixed_radius(camera, T, circle)
+            near.append(Neighbour(Target.expected(p, STRANGER_SIGMA_M, FRUIT_RADIUS_M), circle.colour))
 
 
 def _distance2(robot: Robot, target: Target, circle: Detection, T: Array) -> float:
@@ -255,9 +287,7 @@ async def _shift(robot: Robot, side_m: float) -> None:
     await robot.pause(SETTLE_S)
 
 
-async def servo(
-    robot: Robot, pitch_rad: float, target: Target, fruit: Fruit, place: Point3, near: Sequence[Target] = ()
-) -> str:
+async def servo(robot: Robot, pitch_rad: float, target: Target, fruit: Fruit, place: Point3, near: list[Neighbour]) -> str:
     """Bring the hand to `READY_M` before the fruit by what the camera sees; why it did not, or empty.
 
     Image-based: the features' error through the inverse interaction matrix gives the camera's next step; the distance in
@@ -267,15 +297,15 @@ async def servo(
     for _ in range(LOOKS_MAX):
         look = await robot.eye.look()
         T_base_cam = camera_pose(joints_now(robot))
-        circle = best_match(robot, look.detections, target, T_base_cam, fruit.colour)
-        if circle is None:
+        mine = _told_apart(robot, look.detections, target, fruit.colour, near, T_base_cam)
+        _learn(robot, look.detections, mine, near, T_base_cam)
+        if (circle := mine.get(0)) is None:
             blind += 1
             if blind > BLIND_MAX:
                 return "the camera does not see it"
             continue
         blind = 0
         target.see(robot.eye.camera, T_base_cam, circle.features)
-        _learn_neighbours(robot, look, circle, target, near, T_base_cam)
         if float(np.linalg.norm(target.p_base - np.array(place))) > FAR_OFF_M + FAR_OFF_SIGMAS * fruit.sigma_m:
             return "what the camera sees hangs too far from where the inventory has the fruit"
         gap = T_base_cam[:3, :3].T @ (target.p_base - T_base_cam[:3, 3]) - GOAL_IN_CAMERA_M
@@ -313,13 +343,13 @@ def best_match(
     robot: Robot, circles: Sequence[Detection], target: Target, T_base_cam: Array, colour: str
 ) -> Detection | None:
     """The detection that is most likely the target, within its gate; never of the opposite colour."""
-    opposite = {"red": "green", "green": "red"}.get(colour)
-    scored = [(_distance2(robot, target, c, T_base_cam), index) for index, c in enumerate(circles) if c.colour != opposite]
+    fitting = [(index, c) for index, c in enumerate(circles) if c.colour != OPPOSITE.get(colour)]
+    scored = [(_distance2(robot, target, c, T_base_cam), index) for index, c in fitting]
     within = [pair for pair in scored if pair[0] < GATE_CHI2]
     return circles[min(within)[1]] if within else None
 
 
-async def _take(task: Task, fruit: Fruit, way: Approach, target: Target) -> Pick:
+async def _take(task: Task, fruit: Fruit, way: Approach, target: Target, near: list[Neighbour]) -> Pick:
     """The irreversible part: under a permit, and nothing of it is begun after the permit's validity."""
     robot = task.robot
     before = await robot.eye.look()
@@ -328,12 +358,12 @@ async def _take(task: Task, fruit: Fruit, way: Approach, target: Target) -> Pick
     permit, asked_s = await task.take_permit(fruit.fruit_id)
     await task.keep_picture(permit, "before", before)
     why = ""
-    for _ in range(GRASPS_MAX):
+    for deeper_m in DEEPER_M:
         if robot.clock.now() - asked_s > permit.valid_for_s:
             why = why or "the permit ran out"
             break
         try:
-            held = await _grasp(robot, way, target)
+            held = await _grasp(robot, way, target, deeper_m)
         except Refused as error:
             why = reason_unless_halted(error)
             break
@@ -342,7 +372,7 @@ async def _take(task: Task, fruit: Fruit, way: Approach, target: Target) -> Pick
         why = "nothing was held: the force sensor felt no fruit"
         await _go_along(robot, _reversed_way(target, way), PULL_SHARE, Grip(way.opening_m, way.roll_rad))
         try:
-            lost = await servo(robot, way.pitch_rad, target, fruit, _place(task, fruit))
+            lost = await servo(robot, way.pitch_rad, target, fruit, _place(task, fruit), near)
         except Refused as error:
             lost = reason_unless_halted(error)
         if lost:
@@ -360,10 +390,10 @@ def _reversed_way(target: Target, way: Approach) -> list[Joints]:
     return list(way_in(_point(target.p_base), way.pitch_rad, 0.0, READY_M))
 
 
-async def _grasp(robot: Robot, way: Approach, target: Target) -> bool:
+async def _grasp(robot: Robot, way: Approach, target: Target, deeper_m: float) -> bool:
     """Advance straight onto the fruit and close; whether the force sensor feels it."""
     grip = Grip(way.opening_m, way.roll_rad)
-    await _go_along(robot, way_in(_point(target.p_base), way.pitch_rad, READY_M, 0.0), ADVANCE_SHARE, grip)
+    await _go_along(robot, way_in(_point(target.p_base), way.pitch_rad, READY_M, -deeper_m), ADVANCE_SHARE, grip)
     await close_gripper(robot)
     force_n = robot.state().force_n
     if force_n is None:
@@ -450,6 +480,14 @@ async def _go_along(robot: Robot, path: Sequence[Joints], share: float, grip: Gr
     while robot.clock.now() < settled_s:
         robot.body.want(arm=now, arm_s=0.1, gripper_m=grip.opening_m, roll_rad=_roll(robot, grip))
         await robot.tick()
+
+
+async def _swing_before(robot: Robot, way: Approach) -> None:
+    """Before the fruit: out of the plant first, aside where nothing hangs, and straight in."""
+    grip = Grip(way.opening_m, way.roll_rad)
+    await withdraw(robot)
+    await _swing(robot, way.back, grip)
+    await _go_along(robot, (way.look,), FAST_SHARE, grip)
 
 
 async def _swing(robot: Robot, goal: Joints, grip: Grip) -> None:
