@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from core.errors import Refused
 from core.geometry.pinhole import Camera, from_fov, sphere_outline
-from core.manipulation.approach import approaches
+from core.manipulation.approach import ROLLS_RAD, Obstacle, approaches
 from core.manipulation.eye import camera_pose, scan_poses
 from core.manipulation.kinematics import Array
 from core.robots import gardener
@@ -65,13 +66,14 @@ def in_base(pose: Pose2, fruit: FruitTruth) -> tuple[float, float, float]:
     return float(q[0]), float(q[1]), float(q[2])
 
 
-def reachable(pose: Pose2, fruit: FruitTruth) -> bool:
-    """Whether joints exist that bring the hand straight to the fruit's true place, clear of pot, dock and body."""
+def reachable(pose: Pose2, fruit: FruitTruth, others: Sequence[FruitTruth] = ()) -> bool:
+    """Whether joints exist that bring the hand straight to the fruit's true place, clear of pot, dock, body and `others`."""
+    obstacles = [Obstacle(centre=in_base(pose, other), radius_m=other.radius_m) for other in others if other.id != fruit.id]
     try:
-        approaches(in_base(pose, fruit), fruit.radius_m, [])
+        ways = approaches(in_base(pose, fruit), fruit.radius_m, obstacles, ROLLS_RAD)
     except Refused:
         return False
-    return True
+    return ways[0].room_m >= 0.0
 
 
 def visible(world: World, pose: Pose2, hanging: list[FruitTruth]) -> set[str]:

@@ -53,6 +53,8 @@ class Trial:
     tried: tuple[Tried, ...]
     unknown: int
     """Reachable red fruit that the inventory did not have: nobody was sent for them."""
+    behind: int = 0
+    """Red fruit that the hand could reach if no unripe fruit hung in its way: not tried."""
     torn_green: int
     torn_other: int
     failures: tuple[str, ...] = ()
@@ -74,7 +76,10 @@ async def _trial(seed: int, detector: str, folder: Path) -> Trial:
         before = hanging(garden)
         known = (await garden.get(PLANT, "/inventory?colour=red"))["fruits"]
         pose = garden.truth().robot(ROBOT).pose
-        reach = {fruit.id for fruit in before if fruit.colour == "red" and reachable(pose, fruit)}
+        red = [fruit for fruit in before if fruit.colour == "red"]
+        others = [fruit for fruit in before if fruit.colour != "red"]
+        reach = {fruit.id for fruit in red if reachable(pose, fruit, others)}
+        behind = sum(reachable(pose, fruit) for fruit in red) - len(reach)
         named = {fruit_id: known[index]["fruit_id"] for index, fruit_id, _ in matched(known, before).pairs}
         wanted = {fruit_id: named[fruit_id] for fruit_id in sorted(reach) if fruit_id in named}
         picks: dict[str, dict[str, Any]] = {}
@@ -85,11 +90,17 @@ async def _trial(seed: int, detector: str, folder: Path) -> Trial:
             picks = {pick["fruit_id"]: pick for pick in task.get("picks", ())}
             if task["state"] not in ("done", "failed"):
                 failures.append(f"harvest: {task['state']}: {task['reason']}")
-        return _judged(garden, seed, wanted, len(reach) - len(wanted), picks, failures)
+        return _judged(garden, seed, wanted, len(reach) - len(wanted), behind, picks, failures)
 
 
 def _judged(
-    garden: Garden, seed: int, wanted: dict[str, str], unknown: int, picks: dict[str, dict[str, Any]], failures: list[str]
+    garden: Garden,
+    seed: int,
+    wanted: dict[str, str],
+    unknown: int,
+    behind: int,
+    picks: dict[str, dict[str, Any]],
+    failures: list[str],
 ) -> Trial:
     fruit = {f.id: f for f in garden.truth().plant(PLANT).fruit}
     tried = []
@@ -105,6 +116,7 @@ def _judged(
         seed=seed,
         tried=tuple(tried),
         unknown=unknown,
+        behind=behind,
         torn_green=green,
         torn_other=len(others) - green,
         failures=tuple(failures),
@@ -146,6 +158,7 @@ def _judge(seed: int, best: list[Trial], features: list[Trial]) -> Result:
         "tried": count,
         "seeds": len(best),
         "not_in_inventory": sum(t.unknown for t in best),
+        "behind_unripe": sum(t.behind for t in best),
         "features_success_ratio": _success(features),
         "features_median_s": _median_s(features),
         "features_tried": sum(len(t.tried) for t in features),
