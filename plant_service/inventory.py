@@ -17,6 +17,9 @@ SCANS_KEPT = 64
 FRUITS_MAX = 500
 COUNTED_MIN = 0.5
 """Fruit less likely than this are listed, but not counted."""
+LOOK_AGAIN_S, LOOK_AGAIN_S_MAX = 2 * 3600.0, DAY_S
+"""Fruit that should have become ripe, or whose pick failed, are looked at again after this; at each failure after twice as
+long, up to a day."""
 TRY_AGAIN_S = DAY_S
 """An unreachable fruit that has not moved is tried again after a day: plants change without being looked at."""
 
@@ -129,6 +132,13 @@ class Fruits:
         evidence = self._evidence.get(fruit_id)
         return evidence.ripe_since_s if evidence else None
 
+    def look_again_s(self, fruit_id: str) -> float:
+        """When a fruit whose pick failed should be looked at: after each failure later, for robots have other work."""
+        evidence = self._evidence.get(fruit_id)
+        if evidence is None or not evidence.failures:
+            return 0.0
+        return evidence.failed_s + min(LOOK_AGAIN_S * 2.0 ** (evidence.failures - 1), LOOK_AGAIN_S_MAX)
+
     def remove(self, fruit_id: str, if_match: str) -> Inventory:
         """Raises PreconditionFailed unless `if_match` is the ETag (or `*`), NotFound for an unknown fruit."""
         if if_match != "*" and etag(self._inventory) not in [part.strip() for part in if_match.split(",")]:
@@ -143,10 +153,14 @@ class Fruits:
     def _mark(self, fruit: Fruit, pick: Pick, now_s: float) -> Fruit:
         """It hangs there still, and why."""
         why = pick.reason or f"{pick.outcome}, no reason given"
+        evidence = self._evidence.get(fruit.fruit_id) or Track.of(fruit).evidence
         if pick.outcome == "failed":
+            if fruit.failed == why:
+                return fruit.model_copy(update={"in_doubt": False})
+            tried = {"failures": evidence.failures + 1, "failed_s": now_s}
+            self._evidence[fruit.fruit_id] = evidence.model_copy(update=tried)
             return fruit.model_copy(update={"failed": why, "in_doubt": False})
         place = Place(x_m=fruit.x_m, y_m=fruit.y_m, z_m=fruit.z_m)
-        evidence = self._evidence.get(fruit.fruit_id) or Track.of(fruit).evidence
         self._evidence[fruit.fruit_id] = evidence.model_copy(update={"marked_at": place, "marked_s": now_s})
         return fruit.model_copy(update={"unreachable": why, "in_doubt": False})
 

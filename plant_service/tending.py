@@ -18,7 +18,7 @@ from core.wire.fruit import Forecast, Fruit, FruitCounts, LedgerLine, Pick, Scan
 from core.wire.market import Permit, PermitRequest, Report, ReportAnswer, Task, TaskRequest
 from core.wire.plant import Settings
 from plant_service import ledger
-from plant_service.inventory import Fruits, InventoryDocument
+from plant_service.inventory import LOOK_AGAIN_S, Fruits, InventoryDocument
 from plant_service.journal import Journal
 from plant_service.keeper import Keeper
 from plant_service.ledger import Ledger
@@ -30,8 +30,6 @@ SIGMA_M_MAX = 0.03
 """A hand finds no fruit that is known less well than this: one view alone saw it, and often it is none."""
 KEEP_RIPE, KEEP_RIPE_S = 2, 6 * 3600.0
 """So many ripe fruit are left for people who order some, for so long: a pot asks for all others to be picked at once."""
-LOOK_AGAIN_S = 2 * 3600.0
-"""Fruit that should have become ripe, or whose pick failed, are looked at again after this."""
 AFTER_FAILURE_S = 1800.0
 OWN = "fruit"
 """Who asks when the plant asks for its fruit."""
@@ -186,7 +184,7 @@ class Tending:
         if age_s < LOOK_AGAIN_S:
             return ""
         ripening = [h.fruit for h in hopes if h.fruit.colour != "red" and h.belief.red(now_s) >= 0.5]
-        failed = [h.fruit for h in hopes if h.fruit.failed]
+        failed = [h.fruit for h in hopes if h.fruit.failed and now_s >= fruits.look_again_s(h.fruit.fruit_id)]
         if found := [fruit.fruit_id for fruit in [*ripening, *failed]]:
             return f"{', '.join(found)} should be looked at: {'ripe by now' if ripening else 'the last pick failed'}"[:300]
         return ""

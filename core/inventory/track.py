@@ -41,6 +41,9 @@ class Evidence(Document):
     marked_at: Place | None = None
     """Where it hung when a robot could not reach it."""
     marked_s: GardenSeconds = 0.0
+    failures: Count = 0
+    """Picks of it that failed, and when the last did."""
+    failed_s: GardenSeconds = 0.0
     ripe_since_s: GardenSeconds | None = None
     """When it was first seen red, if it has been since."""
     blind_scans: Count = 0
