@@ -37,6 +37,10 @@ def _table(title: str, *headings: str) -> Table:
 
 def plants(states: Sequence[PlantState]) -> Table:
     table = _table("Pots", "pot", "soil", "green", "turning", "red", "asks", "today ml", "tasks", "dock", "waiting for")
+    table.padding = (0, 1, 0, 0)
+    for column in table.columns:
+        # A narrow terminal folds what is long, never a pot's name or a count.
+        column.no_wrap, column.overflow = column.header in ("pot", "green", "turning", "red"), "fold"
     for state in states:
         soil = state.soil
         wet = f"{soil.ratio:.3f}" if soil.ratio is not None else f"{soil.state}: {soil.why}"
