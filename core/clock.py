@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from asyncio import get_running_loop
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Protocol, TypeVar
@@ -43,7 +44,7 @@ class _LoopClock:
         self._offset_s = offset_s
 
     def now(self) -> float:
-        return asyncio.get_running_loop().time() + self._offset_s
+        return get_running_loop().time() + self._offset_s
 
     async def sleep(self, seconds: float) -> None:
         await asyncio.sleep(max(0.0, seconds))

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import asyncio
+from asyncio import get_running_loop
 from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Protocol
@@ -131,13 +132,17 @@ class MemoryLink:
                 raise LinkDown(f"{self._name} was closed by the other side")
             if self._reader is not None:
                 raise RuntimeError(f"two readers at {self._name}")
-            self._reader = asyncio.get_running_loop().create_future()
+            self._reader = get_running_loop().create_future()
             try:
                 await self._reader
             finally:
                 self._reader = None
-        data = bytes(self._buffer[:READ_BYTES_MAX])
-        del self._buffer[:READ_BYTES_MAX]
+        if len(self._buffer) <= READ_BYTES_MAX:
+            data = bytes(self._buffer)
+            self._buffer.clear()
+        else:
+            data = bytes(self._buffer[:READ_BYTES_MAX])
+            del self._buffer[:READ_BYTES_MAX]
         return data
 
     def write(self, data: bytes) -> None:
@@ -153,7 +158,7 @@ class MemoryLink:
 
     def _launch(self, data: bytes | None) -> None:
         self._flight.append(data)
-        loop = asyncio.get_running_loop()
+        loop = get_running_loop()
         loop.call_at(loop.time() + self._latency_s, self._land)
 
     def _land(self) -> None:

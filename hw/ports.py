@@ -33,6 +33,9 @@ class ChargingState(Enum):
     FAULT = 5
 
 
+_CHARGES = (ChargingState.RECONDITIONING, ChargingState.FULL_CHARGING, ChargingState.TRICKLE)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BaseReading:
     """One sample of a Create base. Travel is cumulative since the driver connected, as the wheels' encoders saw it."""
@@ -71,8 +74,7 @@ class BaseReading:
     @property
     def mated(self) -> bool:
         """On a dock with charge current flowing, which is the only proof of docking."""
-        charging = self.charging in (ChargingState.RECONDITIONING, ChargingState.FULL_CHARGING, ChargingState.TRICKLE)
-        return self.home_base and charging and self.current_a > 0.0
+        return self.home_base and self.current_a > 0.0 and self.charging in _CHARGES
 
 
 class Base(Protocol):

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from core.robots import gardener as g
 from core.robots.markers import ceiling_markers
 from core.scenario import Robot, Scenario
@@ -72,6 +70,7 @@ class RobotBody:
         self.stuck_v: float | None = None
         joint = model.joint(f"{robot.id}/free")
         self.qpos, self.dof = int(joint.qposadr[0]), int(joint.dofadr[0])
+        self._free = data.qpos[self.qpos : self.qpos + 7]
         self.marker_rng = generator(seed, f"markers/{robot.id}")
         self.analog_rng = generator(seed, f"analog/{robot.id}")
         self.pose = self._pose()
@@ -127,7 +126,7 @@ class RobotBody:
         return float(1.0 - 2.0 * (x * x + y * y))
 
     def _pose(self) -> Planar:
-        x, y, z, *q = self._data.qpos[self.qpos : self.qpos + 7].tolist()
+        x, y, z, *q = self._free.tolist()
         return Planar(x, y, yaw_of(*q), z)
 
     # CreateBody
@@ -192,7 +191,7 @@ class RobotBody:
         return volts
 
     def _noisy(self, volts: float, sigma_v: float) -> float:
-        return float(np.clip(volts + self.analog_rng.normal(0.0, sigma_v), 0.0, 5.0))
+        return float(min(5.0, max(0.0, volts + self.analog_rng.normal(0.0, sigma_v))))
 
     # MarkerCamera
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 CAPACITY_RATIO = 0.40
 """Field capacity of potting soil: what lies above drains away."""
@@ -34,10 +35,16 @@ def light_ratio(hour: float) -> float:
 
 def demand_mlps(litres_per_day: float, hour: float) -> float:
     """What a plant and its soil give off just now [ml/s] when water is plentiful; a day of it is `litres_per_day`."""
+    return 1000.0 * litres_per_day * _share_ps(hour)
+
+
+@lru_cache(maxsize=1)
+def _share_ps(hour: float) -> float:
+    """Part of a day's loss that falls into this second [1/s]; asked for every pot of a garden at the same hour."""
     by_night = NIGHT_SHARE / DAY_S
     daylight_s = (SUNSET_H - SUNRISE_H) * 3600.0
     by_day = (1.0 - NIGHT_SHARE) * math.pi / (2.0 * daylight_s) * light_ratio(hour)
-    return 1000.0 * litres_per_day * (by_night + by_day)
+    return by_night + by_day
 
 
 @dataclass(slots=True, kw_only=True)

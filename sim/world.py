@@ -56,7 +56,8 @@ class World:
         station = scenario.station
         self.tap_board = TapBoard(tuple(f"{station.id}/{dock.id}" for dock in station.docks if dock.tap))
         self.touch = Touch(self.model, self.data, tuple(self.robots))
-        self._pot_discs: list[beams.Disc] = [(*pot.place, g.POT_RADIUS_M) for pot in self.pots.values()]
+        self._places = {name: pot.place for name, pot in self.pots.items()}
+        self._pot_discs: list[beams.Disc] = [(*place, g.POT_RADIUS_M) for place in self._places.values()]
         self._owed_s = 0.0
         self._still: bool | None = None
         """Whether nothing moves; None until asked after a step."""
@@ -132,13 +133,12 @@ class World:
         self.touch.look(self.time_s, poses, {name: robot.docked_at for name, robot in self.robots.items()})
 
     def _pour(self, dt_s: float) -> None:
-        places = {name: pot.place for name, pot in self.pots.items()}
         for robot in self.robots.values():
             if not robot.pumping:
                 continue
             drawn_ml = robot.tank.pump(dt_s)
             robot.pumped_ml += drawn_ml
-            below = lands_in(robot.arm.nozzle(), places)
+            below = lands_in(robot.arm.nozzle(), self._places)
             if below is None:
                 self.spilt_ml += drawn_ml
             else:

@@ -152,6 +152,9 @@ class PoseFilter:
         return True
 
 
+_EYE = np.eye(6)
+
+
 def _moved(mean: Array, P: Array, d_left_m: float, d_right_m: float, wheelbase_m: float) -> tuple[Array, Array]:
     """Prediction: mean and covariance after one increment."""
     x, y, yaw, travel, turn, veer = mean.tolist()
@@ -160,7 +163,7 @@ def _moved(mean: Array, P: Array, d_left_m: float, d_right_m: float, wheelbase_m
     true_s, true_w = s_m * (1 + travel), w_rad * (1 + turn) + s_m * veer
     middle = yaw + true_w / 2
     cos, sin = math.cos(middle), math.sin(middle)
-    F = np.eye(6)
+    F = _EYE.copy()
     F[0, 2], F[1, 2] = -true_s * sin, true_s * cos
     F[0, 3], F[1, 3] = s_m * cos, s_m * sin
     F[2, 4], F[2, 5] = w_rad, s_m
@@ -172,7 +175,7 @@ def _moved(mean: Array, P: Array, d_left_m: float, d_right_m: float, wheelbase_m
     q_m = NOISE_M2_PER_M * run_m + 1e-7 * spun_rad
     q_rad = NOISE_RAD2_PER_RAD * spun_rad + NOISE_RAD2_PER_M * run_m
     q_error = WANDER_PER_M * (run_m + 0.1 * spun_rad)
-    moved_P[np.arange(6), np.arange(6)] += (q_m, q_m, q_rad, q_error, q_error, q_error)
+    moved_P.reshape(36)[::7] += (q_m, q_m, q_rad, q_error, q_error, q_error)
     return moved_mean, moved_P
 
 

@@ -1,8 +1,8 @@
 """What crosses the local stream between a robot's brain and its body: one JSON document a line.
 
-Plain dataclasses rather than pydantic: the stream runs at 50 Hz and both ends are the same robot. A field at its default
-is left out of the line. `decode` still refuses wrong types, unknown fields and non-finite numbers, since the body must
-survive any brain.
+Plain dataclasses rather than pydantic: the stream runs at 50 Hz and both ends are the same robot; of pydantic it takes only
+the JSON, four times as fast as the standard library's. A field at its default is left out of the line. `decode` still
+refuses wrong types, unknown fields and non-finite numbers, since the body must survive any brain.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from math import isfinite
 from operator import attrgetter
 from types import NoneType
 from typing import Any, Literal
+
+from pydantic_core import from_json, to_json
 
 from core.errors import Unprocessable
 
@@ -126,6 +128,7 @@ _NAMES = {cls: name for name, cls in _KINDS.items()}
 _FIELDS = {cls: tuple((f.name, f.default) for f in fields(cls)) for cls in (*_NAMES, Marker)}
 _VALUES = {cls: attrgetter(*(name for name, _ in told)) for cls, told in _FIELDS.items() if len(told) > 1}
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False)
+"""For what might hold a number that is not finite: it raises."""
 
 
 def encode(message: Message) -> bytes:
@@ -134,7 +137,10 @@ def encode(message: Message) -> bytes:
     document = {"t": _NAMES[cls], **_told(message)}
     if (marker := document.get("marker")) is not None:
         document["marker"] = _told(marker)
-    return _ENCODER.encode(document).encode() + b"\n"
+    line = to_json(document, inf_nan_mode="constants")
+    if b"NaN" in line or b"Infinity" in line:
+        return _ENCODER.encode(document).encode() + b"\n"
+    return line + b"\n"
 
 
 def _told(message: Any) -> dict[str, Any]:
@@ -180,8 +186,8 @@ _ITEMS: dict[str, tuple[frozenset[type], int | None]] = {
 def decode(line: bytes) -> Message:
     """Read one line; raises Unprocessable for anything that is not exactly a message."""
     try:
-        document = _DECODER.decode(line.decode())
-    except (ValueError, RecursionError) as error:
+        document = from_json(line, allow_inf_nan=False)
+    except ValueError as error:
         raise Unprocessable(f"not a body message: {error}") from error
     if not isinstance(document, dict) or (cls := _KINDS.get(str(document.pop("t", "")))) is None:
         raise Unprocessable("not a body message: unknown kind")
@@ -231,13 +237,6 @@ def _marker(document: dict[str, Any]) -> Marker:
         raise Unprocessable(str(error)) from error
 
 
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number we take")
-
-
-_DECODER = json.JSONDecoder(parse_constant=_refuse_constant)
-
-
 @dataclass(slots=True)
 class LineBuffer:
     """Cuts a byte stream into lines; a line longer than `limit` is an error of the other side."""
@@ -246,6 +245,8 @@ class LineBuffer:
     pending: bytearray = field(default_factory=bytearray)
 
     def feed(self, data: bytes) -> list[bytes]:
+        if not self.pending and data.endswith(b"\n"):
+            return [line for line in data.split(b"\n") if line]
         self.pending += data
         if b"\n" not in self.pending and len(self.pending) > self.limit:
             self.pending.clear()

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from operator import itemgetter
 
 from core.clock import Clock
 from hw.drivers.session import LONG_REST_S, Pulse, Session
@@ -53,6 +54,11 @@ PACKETS = {
     Model.CREATE2: (*_COMMON, Packet.ENCODER_LEFT, Packet.ENCODER_RIGHT),
 }
 _CHARGING = {state.value: state for state in ChargingState}
+_FAULT = ChargingState.FAULT
+_TOLD = itemgetter(*map(int, _COMMON))
+_DISTANCE, _ANGLE = int(Packet.DISTANCE_MM), int(Packet.ANGLE_DEG)
+_LEFT, _RIGHT = int(Packet.ENCODER_LEFT), int(Packet.ENCODER_RIGHT)
+_CREATE1, _PASSIVE, _SAFE, _FULL = Model.CREATE1, Mode.PASSIVE, Mode.SAFE, Mode.FULL
 
 
 class CreateDriver(Session):
@@ -194,7 +200,7 @@ class CreateDriver(Session):
 
     def _halt(self, *, again: bool) -> None:
         """Zero rims in our mode, Start in Passive when something may be moving."""
-        if self._mode in (Mode.SAFE, Mode.FULL):
+        if self._mode in (_SAFE, _FULL):
             self._send_rims((0, 0), again=again)
         elif self._seeking or again:
             self._seeking = False
@@ -287,22 +293,24 @@ class CreateDriver(Session):
     def _travelled(self, values: dict[int, int], now_s: float) -> tuple[float, float]:
         """Left and right travel [m] since the last reading; what no wheel can have done is dropped."""
         first = self._reading is None
-        if self._model is Model.CREATE1:
-            mean_m = values[Packet.DISTANCE_MM] / 1000.0
-            half_m = 0.5 * self._wheelbase_m * math.radians(values[Packet.ANGLE_DEG])
+        if self._model is _CREATE1:
+            mean_m = values[_DISTANCE] / 1000.0
+            half_m = 0.5 * self._wheelbase_m * math.radians(values[_ANGLE])
             left_m, right_m = mean_m - half_m, mean_m + half_m
         else:
-            ticks = (values[Packet.ENCODER_LEFT], values[Packet.ENCODER_RIGHT])
-            left_m, right_m = (
-                counter_delta(new, old) * self._m_per_tick for new, old in zip(ticks, self._ticks or ticks, strict=True)
-            )
+            ticks = (values[_LEFT], values[_RIGHT])
+            before = self._ticks or ticks
+            left_m = counter_delta(ticks[0], before[0]) * self._m_per_tick
+            right_m = counter_delta(ticks[1], before[1]) * self._m_per_tick
             self._ticks = ticks
         gap_s = now_s - self._reading.stamp_s if self._reading is not None else 0.0
         credible = max(abs(left_m), abs(right_m)) <= GAP_MPS_MAX * gap_s + 0.05
         return (left_m, right_m) if credible and not first else (0.0, 0.0)
 
     def _read(self, values: dict[int, int], now_s: float) -> BaseReading:
-        bumps, beams = values[Packet.BUMPS_DROPS], ir_beams(values[Packet.IR_OMNI])
+        (bumps, wall, left, front_left, front_right, right, virtual_wall, ir, charging, mv, ma, celsius, mah, capacity_mah,
+         sources, oi_mode) = _TOLD(values)  # fmt: skip
+        beams = ir_beams(ir)
         return BaseReading(
             stamp_s=now_s,
             left_m=self._left_m,
@@ -312,23 +320,23 @@ class CreateDriver(Session):
             drop_right=bool(bumps & 4),
             drop_left=bool(bumps & 8),
             drop_caster=bool(bumps & 16),
-            wall=bool(values[Packet.WALL]),
-            cliff_left=bool(values[Packet.CLIFF_LEFT]),
-            cliff_front_left=bool(values[Packet.CLIFF_FRONT_LEFT]),
-            cliff_front_right=bool(values[Packet.CLIFF_FRONT_RIGHT]),
-            cliff_right=bool(values[Packet.CLIFF_RIGHT]),
-            virtual_wall=bool(values[Packet.VIRTUAL_WALL]),
+            wall=bool(wall),
+            cliff_left=bool(left),
+            cliff_front_left=bool(front_left),
+            cliff_front_right=bool(front_right),
+            cliff_right=bool(right),
+            virtual_wall=bool(virtual_wall),
             ir_red=beams.red,
             ir_green=beams.green,
             ir_field=beams.field,
-            oi_mode=values[Packet.OI_MODE],
-            charging=_CHARGING.get(values[Packet.CHARGING_STATE], ChargingState.FAULT),
-            home_base=bool(values[Packet.CHARGING_SOURCES] & 2),
-            voltage_v=values[Packet.VOLTAGE_MV] / 1000.0,
-            current_a=values[Packet.CURRENT_MA] / 1000.0,
-            charge_ah=values[Packet.CHARGE_MAH] / 1000.0,
-            capacity_ah=values[Packet.CAPACITY_MAH] / 1000.0,
-            battery_temperature_c=float(values[Packet.TEMPERATURE_C]),
+            oi_mode=oi_mode,
+            charging=_CHARGING.get(charging, _FAULT),
+            home_base=bool(sources & 2),
+            voltage_v=mv / 1000.0,
+            current_a=ma / 1000.0,
+            charge_ah=mah / 1000.0,
+            capacity_ah=capacity_mah / 1000.0,
+            battery_temperature_c=float(celsius),
         )
 
     def _care(self, moved_m: float, now_s: float) -> None:
@@ -344,8 +352,8 @@ class CreateDriver(Session):
             return
         self._rolled_m += moved_m
         rolling = self._rolled_m > ROLLING_M
-        if self._mode is Mode.PASSIVE:
-            if rolling or reading.oi_mode != Mode.PASSIVE:
+        if self._mode is _PASSIVE:
+            if rolling or reading.oi_mode != _PASSIVE:
                 self._tell_mode(Mode.PASSIVE, Op.START)
         elif rolling:
             self._send_rims((0, 0), again=True)

@@ -82,6 +82,8 @@ FORMAT: Mapping[int, str] = {
     for number in range(7, 59)
 }
 """struct letter of each packet."""
+_RANGE_OF = {"B": (0, 255), "b": (-128, 127), "H": (0, 65535), "h": (-32768, 32767)}
+_RANGE = {number: _RANGE_OF[letter] for number, letter in FORMAT.items()}
 SIZE: Mapping[int, int] = {number: struct.calcsize(">" + letter) for number, letter in FORMAT.items()}
 LAST_PACKET = {Model.CREATE1: 42, Model.CREATE2: 58}
 
@@ -102,8 +104,7 @@ def members(model: Model, number: int) -> tuple[int, ...]:
 
 def saturate(number: int, value: float) -> int:
     """The nearest value that packet can carry."""
-    letter = FORMAT[number]
-    low, high = {"B": (0, 255), "b": (-128, 127), "H": (0, 65535), "h": (-32768, 32767)}[letter]
+    low, high = _RANGE[number]
     return max(low, min(high, round(value)))
 
 
@@ -122,8 +123,10 @@ class Layout:
             self._order += [(False, part) for part in parts]
         self._struct = struct.Struct("".join(letters))
         self._marks = tuple((at, number) for at, (mark, number) in enumerate(self._order) if mark)
-        self._fields = tuple((at, number) for at, (mark, number) in enumerate(self._order) if not mark)
-        self.packets = tuple(number for _, number in self._fields)
+        self._fields = [at for at, (mark, _) in enumerate(self._order) if not mark]
+        self._blank = [number for _, number in self._order]
+        """Ids where they stand, and where values stand the ids of these."""
+        self.packets = tuple(number for mark, number in self._order if not mark)
 
     @property
     def size(self) -> int:
@@ -132,7 +135,10 @@ class Layout:
 
     def pack(self, values: Mapping[int, int]) -> bytes:
         """Values by packet id into bytes; each must fit its packet (`saturate`)."""
-        return self._struct.pack(*[number if mark else values[number] for mark, number in self._order])
+        told = self._blank.copy()
+        for at, number in zip(self._fields, self.packets, strict=True):
+            told[at] = values[number]
+        return self._struct.pack(*told)
 
     def unpack(self, data: bytes) -> dict[int, int] | None:
         """Bytes into values by packet id; None when an id is not where it should be."""
@@ -140,7 +146,7 @@ class Layout:
         for at, number in self._marks:
             if numbers[at] != number:
                 return None
-        return {number: numbers[at] for at, number in self._fields}
+        return dict(zip(self.packets, map(numbers.__getitem__, self._fields), strict=True))
 
 
 class Checksum(Enum):

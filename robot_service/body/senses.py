@@ -59,6 +59,8 @@ class Senses:
         self._base_since_s: float | None = None
         self._arm_of: ServoReading | None = None
         self._arm: Joints | None = None
+        self._told_of: Joints | None = None
+        self._told: tuple[float, ...] | None = None
         self._stamp_s = 0.0
         self.lull_s = 0.0
         """How much older readings may be, while the devices are asked seldom."""
@@ -80,6 +82,12 @@ class Senses:
             self._arm_of, self._arm = self.servos, arm_angles(self.servos.pulses_us)
         return self._arm
 
+    def _arm_told(self) -> tuple[float, ...] | None:
+        """The arm to a tenth of a milliradian."""
+        if (arm := self.arm_rad) is not self._told_of:
+            self._told_of, self._told = arm, None if arm is None else tuple(round(q, 4) for q in arm)
+        return self._told
+
     def tank_ml(self, now_s: float) -> float | None:
         volts = self._analog_v(gardener.TANK_INPUT, now_s)
         return None if volts is None else max(0.0, volts / gardener.TANK_SENSOR_V_FULL * gardener.TANK_ML)
@@ -95,6 +103,8 @@ class Senses:
 
     def down(self) -> tuple[str, ...]:
         links = (("base", self._base.link), ("servos", self._servos.link), ("markers", self._localizer.link))
+        if links[0][1].up and links[1][1].up and links[2][1].up:
+            return ()
         return tuple(_told(name, link) for name, link in links if not link.up)
 
     def gate_state(
@@ -145,7 +155,7 @@ class Senses:
         refusal: str,
         next_in_s: float,
     ) -> BodyState:
-        b, arm = self.base, self.arm_rad
+        b, arm = self.base, self._arm_told()
         last = self._sight.last
         tank_ml, force_n = self.tank_ml(now_s), self.force_n(now_s)
         stamp_s = self._stamp_s = max(self._stamp_s, b.stamp_s if now_s - b.stamp_s < TRAVEL_FRESH_S else now_s)
@@ -170,7 +180,7 @@ class Senses:
             battery_a=b.current_a,
             tank_ml=None if tank_ml is None else round(tank_ml, 1),
             force_n=None if force_n is None else round(force_n, 2),
-            arm_rad=None if arm is None else tuple(round(q, 4) for q in arm),
+            arm_rad=arm,
             arm_moving=arm_moving or self.servos.moving,
             pump=pump,
             pumped_ml=round(pumped_ml, 3),

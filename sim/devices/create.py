@@ -46,6 +46,8 @@ COMMANDS_PER_STEP_MAX = 200
 STREAM_BYTES_MAX = 255
 """A frame tells its length in one byte; a stream of more packets than that is not sent."""
 _EPS_S = 1e-9
+_OFF, _PASSIVE, _SAFE = Mode.OFF, Mode.PASSIVE, Mode.SAFE
+"""Asked some hundred times a second; to look a member up in its enum costs as much as all the rest."""
 
 
 @dataclass(slots=True)
@@ -90,6 +92,7 @@ class CreateEmulator:
         wheel_diameter_m: float | None = None,
     ) -> None:
         self.model, self.mode = model, start_mode
+        self._checksum = CHECKSUM[model]
         self._body, self._rng, self._red_side = body, rng, red_side
         self._wheelbase_m = wheelbase_m or (0.258 if model is Model.CREATE1 else 0.235)
         self.songs = Songs(16 if model is Model.CREATE1 else 5)
@@ -151,15 +154,17 @@ class CreateEmulator:
 
     def step(self, now_s: float) -> None:
         self._now_s = now_s = max(self._now_s, now_s)
+        sense: CreateSense | None = None
         while self._answers and self._answers[0][0] <= now_s + _EPS_S:
             self._out += self._answers.popleft()[1](now_s)
         if now_s + _EPS_S >= self._tick_s:
             self._tick_s = _next(self._tick_s, TICK_S, now_s)
-            self._tick(self._body.sense())
+            sense = self._body.sense()
+            self._tick(sense)
         if now_s + _EPS_S >= self._frame_s:
             self._frame_s = _next(self._frame_s, self._frame_every_s, now_s)
-            self._send_frame(now_s)
-        if self.mode is Mode.PASSIVE and not self.seeking and now_s - self._command_s + _EPS_S >= SLEEP_S:
+            self._send_frame(sense or self._body.sense(), now_s)
+        if self.mode is _PASSIVE and not self.seeking and now_s - self._command_s + _EPS_S >= SLEEP_S:
             self._off()
         self._set_tick()
 
@@ -172,7 +177,7 @@ class CreateEmulator:
         due_s = min(self._tick_s, self._frame_s)
         if self._answers:
             due_s = min(due_s, self._answers[0][0])
-        if self.mode is Mode.PASSIVE and not self.seeking:
+        if self.mode is _PASSIVE and not self.seeking:
             due_s = min(due_s, self._command_s + SLEEP_S)
         return due_s
 
@@ -180,14 +185,14 @@ class CreateEmulator:
 
     def _set_tick(self) -> None:
         """Tick only while something needs it."""
-        needed = self.mode is Mode.SAFE or self.seeking or self.scripts.waiting or bool(self._queue)
+        needed = self.mode is _SAFE or self.seeking or self.scripts.waiting or bool(self._queue)
         if not needed:
             self._tick_s = math.inf
         elif self._tick_s == math.inf:
             self._tick_s = self._now_s + TICK_S
 
     def _tick(self, sense: CreateSense) -> None:
-        if self.mode is Mode.SAFE and self._unsafe(sense):
+        if self.mode is _SAFE and self._unsafe(sense):
             self._passive()
         if self._seeker is not None:
             self._seek(self._seeker, sense)
@@ -212,11 +217,11 @@ class CreateEmulator:
         else:
             self._set_wheels(left_mps, right_mps)
 
-    def _send_frame(self, now_s: float) -> None:
-        if self._stream_layout is not None and self._stream_on and self.mode is not Mode.OFF:
-            payload = self._stream_layout.pack(self._values(self._stream_layout.packets, now_s))
+    def _send_frame(self, sense: CreateSense, now_s: float) -> None:
+        if self._stream_layout is not None and self._stream_on and self.mode is not _OFF:
+            payload = self._stream_layout.pack(self.senses.values(self._stream_layout.packets, sense, self, now_s))
             if len(payload) <= STREAM_BYTES_MAX:
-                self._out += frame(payload, CHECKSUM[self.model])
+                self._out += frame(payload, self._checksum)
 
     def _values(self, packets: tuple[int, ...], now_s: float) -> dict[int, int]:
         return self.senses.values(packets, self._body.sense(), self, now_s)

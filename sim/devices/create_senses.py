@@ -25,6 +25,8 @@ FULL_RATIO = 0.995
 FLOOR_SIGNAL, DROP_SIGNAL, WALL_SIGNAL = 2600, 20, 160
 SIGNAL_NOISE = 12
 INTERNAL_BAUD_BIT = 0x10
+_CREATE1 = Model.CREATE1
+_NOT_CHARGING = ChargingState.NOT_CHARGING.value
 
 
 class Firmware(Protocol):
@@ -60,6 +62,8 @@ class Senses:
     def __init__(self, model: Model, rng: random.Random, wheelbase_m: float, wheel_m: float, carry: bool) -> None:
         self._model, self._rng = model, rng
         self._wheelbase_m, self._m_per_tick = wheelbase_m, math.pi * wheel_m / TICKS_PER_TURN
+        flags = (False, True)
+        self._ir = {(r, g, f): ir_byte(model, Beams(r, g, f)) for r in flags for g in flags for f in flags}
         self._distance, self._angle = Counter(carry), Counter(carry)
         self.buttons = 0
         self._pressed_until_s = -math.inf
@@ -82,11 +86,11 @@ class Senses:
     # One function a packet that is more than a lookup
 
     def bumps(self, s: CreateSense, r: Firmware, now_s: float) -> int:
-        caster = s.drop_caster and self._model is Model.CREATE1
+        caster = s.drop_caster and self._model is _CREATE1
         return s.bump_right | s.bump_left << 1 | s.drop_right << 2 | s.drop_left << 3 | caster << 4
 
     def infrared(self, s: CreateSense, r: Firmware, now_s: float) -> int:
-        return ir_byte(self._model, Beams(s.ir_red, s.ir_green, s.ir_field))
+        return self._ir[s.ir_red, s.ir_green, s.ir_field]
 
     def distance(self, s: CreateSense, r: Firmware, now_s: float) -> int:
         return self._distance.take(self.travel_mm(s))
@@ -96,7 +100,7 @@ class Senses:
 
     def charging(self, s: CreateSense, r: Firmware, now_s: float) -> int:
         if not (s.contacts and r.may_charge):
-            return ChargingState.NOT_CHARGING.value
+            return _NOT_CHARGING
         if not s.charging:
             return ChargingState.WAITING.value
         if s.charge_ah >= FULL_RATIO * s.capacity_ah:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from core.robots import gardener as g
 
 SETTLED_RAD = 1e-6
@@ -17,6 +15,7 @@ class Arm:
 
     def __init__(self, model: Any, data: Any, robot_id: str, rolls: bool = False) -> None:
         self._data = data
+        self._sensordata = data.sensordata
         self._servos = g.SERVOS | {"roll": g.ROLL_SERVO} if rolls else g.SERVOS
         self._motors = {name: int(model.actuator(f"{robot_id}/{name}").id) for name in self._servos}
         self._angles = {name: int(model.joint(f"{robot_id}/{name}").qposadr[0]) for name in g.ARM_JOINTS}
@@ -75,4 +74,5 @@ class Arm:
 
     def grip_n(self) -> float:
         """Mean squeeze on the finger pads [N]."""
-        return float(np.mean([self._data.sensordata[at] for at in self._touch]))
+        left, right = self._touch
+        return float((self._sensordata[left] + self._sensordata[right]) / 2)

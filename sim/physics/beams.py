@@ -23,6 +23,8 @@ MATED_ALONG_M = 0.015
 MATED_ACROSS_M = 0.020
 MATED_RAD = math.radians(6.0)
 HELD_SLACK = 1.2
+MATED_NEAR_M = 0.05
+"""Further than this along the world's x or y no plates touch."""
 
 WALL_EYE_M = (0.10, -0.142)
 """In the base frame, at the body's edge."""
@@ -39,6 +41,9 @@ class Infrared:
     field: bool = False
 
 
+DARK = Infrared()
+
+
 class Dock:
     """One dock's geometry, from the pose of the robot that stands at it."""
 
@@ -50,6 +55,8 @@ class Dock:
 
     def mated(self, pose: Planar, held: bool = False) -> bool:
         """Do the robot's plates touch the dock's? Sprung plates that already do (`held`) part a little later."""
+        if abs(pose.x_m - self.docked.x_m) > MATED_NEAR_M or abs(pose.y_m - self.docked.y_m) > MATED_NEAR_M:
+            return False
         along, across = self.docked.local(pose.x_m, pose.y_m)
         slack = HELD_SLACK if held else 1.0
         near = abs(along) <= slack * MATED_ALONG_M and abs(across) <= slack * MATED_ACROSS_M and abs(pose.z_m) < 0.02
@@ -61,14 +68,17 @@ class Dock:
         dx, dy = x_m - ex, y_m - ey
         distance = math.hypot(dx, dy)
         if distance > BEAM_RANGE_M:
-            return Infrared()
+            return DARK
         # Positive: counter-clockwise from the dock's outward axis, which is to the right of an arriving robot.
         off = wrap(math.atan2(dy, dx) - self._out_rad)
         on_right = -BEAM_INNER_RAD <= off <= BEAM_OUTER_RAD
         on_left = -BEAM_OUTER_RAD <= off <= BEAM_INNER_RAD
         near = distance <= FIELD_RADIUS_M
-        if not (on_right or on_left or near) or any(_cuts(ex, ey, dx, dy, disc) for disc in discs):
-            return Infrared()
+        if not (on_right or on_left or near):
+            return DARK
+        for disc in discs:
+            if _cuts(ex, ey, dx, dy, disc):
+                return DARK
         red, green = (on_left, on_right) if RED_ON_LEFT else (on_right, on_left)
         return Infrared(red, green, near)
 
@@ -81,6 +91,8 @@ def infrared(docks: Iterable[Dock], pose: Planar, discs: list[Disc]) -> Infrared
         if abs(x_m - dock.emitter[0]) > BEAM_RANGE_M or abs(y_m - dock.emitter[1]) > BEAM_RANGE_M:
             continue
         seen = dock.shines_on(x_m, y_m, discs)
+        if seen is DARK:
+            continue
         red, green, near = red or seen.red, green or seen.green, near or seen.field
     return Infrared(red, green, near)
 
@@ -88,9 +100,12 @@ def infrared(docks: Iterable[Dock], pose: Planar, discs: list[Disc]) -> Infrared
 def wall(pose: Planar, discs: list[Disc]) -> bool:
     """The wall sensor looks to the right from the front right of the body."""
     x_m, y_m = pose.point(*WALL_EYE_M)
+    near = [d for d in discs if max(abs(d[0] - x_m), abs(d[1] - y_m)) < d[2] + WALL_RANGE_M]
+    if not near:
+        return False
     ahead = pose.yaw_rad - math.pi / 2
     dx, dy = WALL_RANGE_M * math.cos(ahead), WALL_RANGE_M * math.sin(ahead)
-    return any(_cuts(x_m, y_m, dx, dy, disc) for disc in discs)
+    return any(_cuts(x_m, y_m, dx, dy, disc) for disc in near)
 
 
 def _cuts(x: float, y: float, dx: float, dy: float, disc: Disc) -> bool:

@@ -149,10 +149,9 @@ class Orchard:
         self._hands = {r.id: int(model.site(f"{r.id}/tool").id) for r in scenario.robots}
         self._bases = {r.id: int(model.body(r.id).id) for r in scenario.robots}
         self._parts = _parts(model, self._bases)
-        self._tendons = np.array([spot.tendon for spot in self.spots], dtype=np.intp)
-        self._slack_m = np.array([spot.stalk_m for spot in self.spots])
-        self._least_n = np.full(len(self.spots), np.inf)
-        """Pull below which no joint breaks, however bent; infinite where nothing hangs."""
+        self._by_tendon = {spot.tendon: spot for spot in self.spots}
+        self._least_m = np.full(model.ntendon, np.inf)
+        """By tendon: a stalk shorter than this does not break, however bent; infinite where nothing hangs."""
         for spot in self.spots:
             model.dof_damping[spot.dof : spot.dof + 3] = DAMPING_LINEAR
             model.dof_damping[spot.dof + 3 : spot.dof + 6] = DAMPING_ANGULAR
@@ -244,9 +243,9 @@ class Orchard:
         self._data.qvel[spot.dof : spot.dof + 6] = 0.0
 
     def _know(self) -> None:
-        self._least_n[:] = [
-            spot.growing.strength_n * (1.0 - BENT_LOSS) if spot.hangs and spot.there else np.inf for spot in self.spots
-        ]
+        for spot in self.spots:
+            least_n = spot.growing.strength_n * (1.0 - BENT_LOSS) if spot.hangs and spot.there else math.inf
+            self._least_m[spot.tendon] = spot.stalk_m + least_n / STALK_NPM
 
     # Being pushed
 
@@ -282,11 +281,13 @@ class Orchard:
     def watch(self) -> bool:
         """Lets stalks break that are pulled too hard; whether one did."""
         # A sleeping tendon has no length; nothing pulls at it either.
-        pulls_n = STALK_NPM * (self._data.ten_length[self._tendons] - self._slack_m)
+        long = self._data.ten_length > self._least_m
+        if not np.count_nonzero(long):
+            return False
         broke = False
-        for index in np.flatnonzero(pulls_n > self._least_n):
-            spot = self.spots[int(index)]
-            if float(pulls_n[index]) > self.strength_n(spot):
+        for tendon in long.nonzero()[0].tolist():
+            spot = self._by_tendon[tendon]
+            if STALK_NPM * (float(self._data.ten_length[tendon]) - spot.stalk_m) > self.strength_n(spot):
                 self.cut(spot, *self._who(spot))
                 broke = True
         return broke
@@ -317,7 +318,7 @@ class Orchard:
         self._tie(spot, False)
         spot.torn_by, spot.torn_how = robot_id, how
         spot.lies_days = 0.0
-        self._least_n[self.spots.index(spot)] = np.inf
+        self._least_m[spot.tendon] = math.inf
         if robot_id is None:
             self.fallen[spot.plant_id].count(spot.growing.colour)
         else:

@@ -59,14 +59,14 @@ class Touch:
     _last: dict[Key, float] = field(default_factory=dict)
     _owner: list[tuple[str, str]] = field(default_factory=list)
     """For every geom: (kind, id)."""
-    _watched: Any = None
+    _watched: tuple[bool, ...] = ()
     _force: Any = None
 
     def __post_init__(self) -> None:
         self.pressed = {robot: Press() for robot in self.robots}
         self.tally = {robot: Tally() for robot in self.robots}
         self._owner = [_owner(self.model.geom(index).name, set(self.robots)) for index in range(self.model.ngeom)]
-        self._watched = np.array([kind in ("shell", "arm") for kind, _ in self._owner])
+        self._watched = tuple(kind in ("shell", "arm") for kind, _ in self._owner)
         self._force = np.zeros(6)
 
     def forget(self) -> None:
@@ -77,13 +77,12 @@ class Touch:
         """Updates `pressed` and `tally`. A mated robot does not feel its own dock: the plates carry it."""
         for press in self.pressed.values():
             press.left = press.right = False
-        count = self.data.ncon
-        if not count:
+        if not self.data.ncon:
             return
-        geoms = self.data.contact.geom
-        hits = self._watched[geoms].any(axis=1).nonzero()[0]
-        for index in hits:
-            self._contact(int(index), int(geoms[index][0]), int(geoms[index][1]), now_s, poses, mated)
+        watched = self._watched
+        for index, (a, b) in enumerate(self.data.contact.geom.tolist()):
+            if watched[a] or watched[b]:
+                self._contact(index, a, b, now_s, poses, mated)
 
     def _contact(
         self, index: int, a: int, b: int, now_s: float, poses: dict[str, Planar], mated: dict[str, str | None]

@@ -45,7 +45,10 @@ class _Creep:
         self.roll(0.0, 1.0)
 
     def roll(self, speed_mps: float, slip_factor: float) -> None:
-        damping = min(DAMPING_MAX, self._per_speed / max(abs(speed_mps), ROLLING_MPS_MIN)) / slip_factor
+        speed_mps = abs(speed_mps)
+        if speed_mps < ROLLING_MPS_MIN:
+            speed_mps = ROLLING_MPS_MIN
+        damping = min(DAMPING_MAX, self._per_speed / speed_mps) / slip_factor
         if damping != self._damping:
             self._damping = damping
             self._row[0] = -1.0
@@ -56,7 +59,7 @@ class Drive:
     """One robot's two wheels and rear caster."""
 
     def __init__(self, model: Any, data: Any, robot: Robot) -> None:
-        self._data = data
+        self._ctrl, self._qpos, self._qvel = data.ctrl, data.qpos, data.qvel
         self._radius_m = g.WHEEL_DIAMETER_M[robot.create] / 2
         self._half_track_m = g.WHEELBASE_M[robot.create] / 2
         sides = ("left", "right")
@@ -87,8 +90,8 @@ class Drive:
             wanted = self.wanted_mps[side] if powered else 0.0
             ramped = _ramp(self.ramped_mps[side], wanted, dt_s)
             self.ramped_mps[side] = ramped
-            self._data.ctrl[self._motors[side]] = ramped / self._radius_m
-        left, right = (self._data.qvel[rate] * self._radius_m for rate in self._rates)
+            self._ctrl[self._motors[side]] = ramped / self._radius_m
+        left, right = (self._qvel.item(rate) * self._radius_m for rate in self._rates)
         self._tyres[0].roll(left, self.slip_factor)
         self._tyres[1].roll(right, self.slip_factor)
         omega = (right - left) / (2 * self._half_track_m)
@@ -96,13 +99,13 @@ class Drive:
 
     def travel_m(self) -> tuple[float, float]:
         """Cumulative rim travel (left, right) as encoders and a nominal wheel see it."""
-        left, right = (float(self._data.qpos[angle]) * self._radius_m for angle in self._angles)
-        return left, right
+        left, right = self._angles
+        return self._qpos.item(left) * self._radius_m, self._qpos.item(right) * self._radius_m
 
     def drop_m(self) -> tuple[float, float]:
         """How far each wheel hangs below its place (left, right)."""
-        left, right = (float(self._data.qpos[spring]) for spring in self._springs)
-        return left, right
+        left, right = self._springs
+        return self._qpos.item(left), self._qpos.item(right)
 
 
 def _ramp(now: float, wanted: float, dt_s: float) -> float:
