@@ -51,7 +51,7 @@ class Reporter:
             await asyncio.gather(*(self._tell(entry) for entry in self._due()), self._tell_ends())
             self._told = {task_id: told for task_id, told in self._told.items() if self.queue.find(task_id)}
             try:
-                async with self.robot.clock.timeout(LOOK_S if self.queue.entries or self._finals else NOTHING_S):
+                async with self.robot.clock.timeout(LOOK_S if self._telling() else NOTHING_S):
                     await self._soon.wait()
             except TimeoutError:
                 pass
@@ -87,6 +87,10 @@ class Reporter:
         if (job := self.jobs.get(entry.task_id)) is not None:
             state = "cancelled" if entry.killed else report.state
             self.jobs[entry.task_id] = job.model_copy(update={"state": state, "reason": report.reason or entry.killed})
+
+    def _telling(self) -> bool:
+        """Whether a plant waits for word of us; of the robot's own errands nobody wants to hear."""
+        return bool(self._finals) or any(entry.announcement is not None for entry in self.queue.entries)
 
     def _due(self) -> list[Entry]:
         now_s = self.robot.clock.now()

@@ -127,11 +127,11 @@ class Robot:
         assert self.body.state is not None
         return "; ".join(self.body.state.down)
 
-    async def pause(self, seconds: float) -> None:
-        """Wait while nothing moves, yet notice an e-stop."""
+    async def pause(self, seconds: float, every_s: float = 0.5) -> None:
+        """Wait while nothing moves, yet notice an e-stop within `every_s`."""
         until_s = self.clock.now() + seconds
         while self.clock.now() < until_s:
-            await self.clock.sleep(min(0.5, max(0.01, until_s - self.clock.now())))
+            await self.clock.sleep(min(every_s, max(0.01, until_s - self.clock.now())))
             self.state()
 
     @asynccontextmanager

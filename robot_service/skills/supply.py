@@ -39,7 +39,7 @@ async def charge(robot: Robot, docks: Docks, travel: Travel, enough: Callable[[f
         hold = docks.holds.get(robot.where.docked_at)
         if hold is not None and hold.wanted_by:
             return
-        await robot.pause(LOOK_EVERY_S)
+        await robot.pause(LOOK_EVERY_S, every_s=LOOK_EVERY_S)
 
 
 async def _find_charger(robot: Robot, docks: Docks, travel: Travel) -> None:
