@@ -57,6 +57,16 @@ def packed(planes: Floats, smooth: Floats, spots: Floats, red_blobs: Floats, gre
     return out
 
 
+@njit(cache=True)
+def rise(brightness: Floats, around: Floats, whiteness: Floats, least: float, out: Floats) -> None:
+    """How far a pixel is brighter than around, from `least` on, times its whiteness; all (h, w), `out` 0..1."""
+    four, start, zero, one = np.float32(4), np.float32(4 * least), np.float32(0), np.float32(1)
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            step = (brightness[y, x] - around[y, x]) * four - start
+            out[y, x] = min(max(step, zero), one) * whiteness[y, x]
+
+
 @njit(cache=True, fastmath=True)
 def bright_colour(maps: Floats, family: int, plane: Floats, source: Floats) -> None:
     """A colour plane (h, w), and the same weighted by brightness: a ball's middle is brighter than its rim."""
@@ -92,6 +102,11 @@ def tops(votes: Floats, least: float, most: int) -> Ints:
             here = votes[y, x]
             if here < least or n == len(found):
                 continue
+            # The next neighbours first: most places fail there.
+            if (x > 0 and votes[y, x - 1] > here) or (x + 1 < width and votes[y, x + 1] > here):
+                continue
+            if (y > 0 and votes[y - 1, x] > here) or (y + 1 < height and votes[y + 1, x] > here):
+                continue
             highest = True
             for j in range(max(y - 2, 0), min(y + 3, height)):
                 for i in range(max(x - 2, 0), min(x + 3, width)):
@@ -115,6 +130,9 @@ def vote(image: Floats, steep: float, radius_min: int, radius_max: int, out: Flo
     """
     height, width = image.shape
     out[:] = 0
+    weights = np.empty(radius_max + 1)
+    for radius in range(radius_min, radius_max + 1):
+        weights[radius] = 1.0 / (2.0 * math.pi * radius)
     for y in range(1, height - 1):
         for x in range(1, width - 1):
             gx = image[y, x + 1] - image[y, x - 1]
@@ -129,7 +147,7 @@ def vote(image: Floats, steep: float, radius_min: int, radius_max: int, out: Flo
                 u = int(x + gx * radius + 0.5)
                 v = int(y + gy * radius + 0.5)
                 if 0 <= u < width and 0 <= v < height:
-                    out[v, u] += 1.0 / (2.0 * math.pi * radius)
+                    out[v, u] += weights[radius]
 
 
 @njit(cache=True, fastmath=True)

@@ -204,8 +204,13 @@ def confidence_of(candidates: Candidates, weights: Weights) -> NDArray[np.float6
 def terms(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Normalised features (n, f) and their products in pairs (n, f + f (f + 1) / 2), within reason."""
     x = np.clip(x, -4, 4)
-    a, b = np.triu_indices(x.shape[1])
+    a, b = _pairs(x.shape[1])
     return np.concatenate([x, x[:, a] * x[:, b]], axis=1)
+
+
+@functools.cache
+def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    return np.triu_indices(count)
 
 
 def _logistic(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -243,8 +248,8 @@ def colour_table(colour: NDArray[np.float64]) -> Floats:
 
 def gains_of(image: Image, norm: float) -> NDArray[np.float64]:
     """Factors (3,) that make the image's generalised mean grey (shades of grey: Finlayson and Trezzi 2004)."""
-    sample = image[::6, ::6].reshape(-1, 3).astype(float) / 255
-    mean = np.maximum((sample**norm).mean(axis=0) ** (1 / norm), 1e-3)
+    powers = (np.arange(256) / 255) ** norm
+    mean = np.maximum(powers[image[::6, ::6].reshape(-1, 3)].mean(axis=0) ** (1 / norm), 1e-3)
     level = BRIGHTNESS + 0.15 * (1 - 1 / norm)
     return np.asarray(np.clip(level / mean, *GAIN_RANGE), float)
 
@@ -265,7 +270,8 @@ class Seen:
         kernels.planes(self.image, bins, luma, table, colours)
         self.red, green, brightness, whiteness = colours
         smooth = smoothness(brightness)
-        blobs = (areas(self.red, smooth), areas(green, smooth))
+        smoothed = 0.4 + 0.6 * smooth
+        blobs = (areas(self.red, smoothed), areas(green, smoothed))
         self.maps: Floats = kernels.packed(colours, smooth, highlights(brightness, whiteness), *blobs)
         """(h, w, MAPS)"""
 
@@ -308,14 +314,18 @@ def highlights(brightness: Floats, whiteness: Floats) -> Floats:
     height, width = brightness.shape
     small = cv2.resize(brightness, (max(width // 4, 1), max(height // 4, 1)), interpolation=cv2.INTER_AREA)
     around = cv2.resize(cv2.blur(small, (7, 7)), (width, height), interpolation=cv2.INTER_LINEAR)
-    step = np.minimum(np.maximum((brightness - around) * 4 - 4 * HIGHLIGHT_STEP, 0), 1) * whiteness
-    return np.asarray(cv2.dilate(step, np.ones((3, 3), np.uint8)), np.float32)
+    step = np.empty_like(brightness)
+    kernels.rise(brightness, np.asarray(around, np.float32), whiteness, HIGHLIGHT_STEP, step)
+    return np.asarray(cv2.dilate(step, _NEAR), np.float32)
+
+
+_NEAR = np.ones((3, 3), np.uint8)
 
 
 def areas(plane: Floats, smooth: Floats) -> Floats:
     """1 on blobs of smooth fruit colour whose area lies between the least and the largest."""
     height, width = plane.shape
-    small = cv2.resize(plane * (0.4 + 0.6 * smooth), (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(plane * smooth, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
     _, labels, stats, _ = cv2.connectedComponentsWithStats((small > BLOB_FROM).astype(np.uint8), connectivity=4)
     share = stats[:, cv2.CC_STAT_AREA] / labels.size
     wanted = ((share >= AREA_MIN) & (share <= AREA_MAX)).astype(np.float32)
