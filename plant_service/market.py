@@ -114,7 +114,8 @@ class Marketplace:
     async def _grant(self, grant: Grant) -> None:
         award = grant.award
         task_id, epoch = award.announcement.task_id, award.epoch
-        answer = await self._send(grant.robot_id, "POST", "/tasks", award.model_dump_json().encode(), f"{task_id}/{epoch}")
+        # Without an Idempotency-Key: a robot knows an award by its task and epoch, and after a restart the words may differ.
+        answer = await self._send(grant.robot_id, "POST", "/tasks", award.model_dump_json().encode())
         if answer is None or answer.status >= 500:
             return
         refused = "" if answer.status < 300 else _reason(answer)
@@ -127,12 +128,12 @@ class Marketplace:
                 return
             await self._clock.sleep(KILL_AGAIN_S)
 
-    async def _send(self, robot_id: str, method: str, path: str, body: bytes = b"", key: str = "") -> Answer | None:
+    async def _send(self, robot_id: str, method: str, path: str, body: bytes = b"") -> Answer | None:
         """The robot's answer, whatever it says; None when there was none."""
         if (peer := self._peers.find(robot_id)) is None:
             return None
         try:
-            return await self._mesh.exchange(peer, method, path, body, key=key)
+            return await self._mesh.exchange(peer, method, path, body)
         except PeerDown:
             return None
 

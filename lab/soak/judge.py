@@ -18,6 +18,7 @@ from core.allocation.plant_state import Limits, MarketDocument
 from core.allocation.queue import Entry
 from core.mesh.client import Answer
 from core.wire.body import COMMAND_LIFE_S
+from core.wire.fruit import Inventory
 from core.wire.market import BID_WINDOW_S, FINAL_STATES, LEASE_S, Bid, BidRound, Task
 from lab.soak.faults import Gremlin
 from lab.soak.garden import COARSE, SoakGarden
@@ -25,7 +26,7 @@ from lab.soak.net import CLEAR, Message
 from lab.soak.world import Dose, Truth
 from robot_service.planner import TASK_S
 
-LOOK_S = 5.0
+LOOK_S = 10.0
 SKEW = 1.0005
 """Clocks differ by so much at most."""
 STOP_S = COMMAND_LIFE_S + COARSE["robot_service.body.body"]["DT_S"] + 0.05
@@ -120,6 +121,11 @@ class Judge:
         self._stopped: set[str] = set()
         self._apart: dict[tuple[str, str, int], float] = {}
         self._documents: dict[str, MarketDocument] = {}
+        self._lives: dict[str, object] = {}
+        self._rounds: set[tuple[str, int]] = set()
+        self._inventories: dict[str, Inventory] = {}
+        self._open: defaultdict[str, set[str]] = defaultdict(set)
+        """Tasks by plant that were on disk and had not ended."""
         self._limits = Limits()
 
     def attach(self, garden: SoakGarden) -> None:
@@ -244,9 +250,12 @@ class Judge:
             self.breach("I4", f"{message.target} answered 500 to {message.method} {message.path}")
         if answer.status in (400, 405, 422) and message.source != "operator":
             route = f"{message.method} {message.path.partition('?')[0]}"
-            self.breach("I7", f"{message.target} does not understand {route} of {message.source}")
+            why = json.loads(answer.body)["detail"]
+            self.breach("I7", f"{message.target} does not understand {route} of {message.source}: {why}")
         if answer.status >= 300 or message.method == "GET":
             return
+        if message.target.startswith("plant"):
+            self._changed(message.target)
         if message.path.endswith("/permits"):
             self._permit(message, answer)
         elif message.path == "/tasks" and message.target.startswith("plant"):
@@ -257,11 +266,12 @@ class Judge:
             generation = json.loads(answer.body)["generation"]
             self._generation[message.target] = max(self._generation[message.target], generation)
         elif message.path.endswith("/reports") and b'"picked"' in message.body:
-            self._picks_told(message, answer)
+            self._picks_told(message)
+            self._inventories.pop(message.target, None)
         elif message.path == "/stop":
             self._stopped.add(message.target)
 
-    def _picks_told(self, message: Message, answer: Answer) -> None:
+    def _picks_told(self, message: Message) -> None:
         for pick in json.loads(message.body)["picks"]:
             held = self._permits.get(pick["permit_id"])
             if pick["outcome"] == "picked" and held is not None and held.robot_id == message.source:
@@ -305,20 +315,27 @@ class Judge:
             if (brain := self.garden.brain(robot_id)) is not None
         }
         for plant_id in self.garden.names("plant"):
-            pot = self.garden.pot(plant_id)
-            if pot is None or (document := pot.place._keeper.durable) is None:
-                continue
-            known = self._documents.get(plant_id) is document
-            self._documents[plant_id] = document
-            if not known:
-                self._document(plant_id, document)
-            self._fruits(plant_id)
-            for task in document.tasks:
-                if not known or task.state not in FINAL_STATES:
-                    self._task(plant_id, task)
-                    self._agree(plant_id, task, entries)
+            for task in self._changed(plant_id):
+                if task.state not in FINAL_STATES:
+                    self._in_time(plant_id, task, self._seen[task.task_id])
+                self._agree(plant_id, task, entries)
         for robot_id, held in entries.items():
             self._queue(robot_id, held)
+
+    def _changed(self, plant_id: str) -> list[Task]:
+        """Judge a plant's documents if they are other ones than before; its tasks as they are on disk."""
+        pot = self.garden.pot(plant_id)
+        if pot is None or (document := pot.place._keeper.durable) is None:
+            return []
+        if self._documents.get(plant_id) is not document:
+            self._documents[plant_id] = document
+            self._document(plant_id, document)
+            for task in document.tasks:
+                self._task(plant_id, task)
+        if self._inventories.get(plant_id) is not pot.tending._fruits.machine.inventory:
+            self._inventories[plant_id] = pot.tending._fruits.machine.inventory
+            self._fruits(plant_id)
+        return document.tasks
 
     def crashed(self, name: str) -> None:
         """I4: judged once it is up again, by the next look."""
@@ -328,10 +345,9 @@ class Judge:
             self.breach("I4", f"{plant_id} is back at boot {document.boot} after {self._boot[plant_id]}")
         self._boot[plant_id] = document.boot
         known = {task.task_id for task in document.tasks}
-        for task_id, seen in self._seen.items():
-            if task_id.startswith(f"{plant_id}:") and task_id not in known and seen.state not in FINAL_STATES:
-                seen.state = "cancelled"
-                self.breach("I4", f"{task_id} was on disk and is gone")
+        for task_id in self._open[plant_id] - known:
+            self._open[plant_id].discard(task_id)
+            self.breach("I4", f"{task_id} was on disk and is gone")
         for task_id in [t for t in self._created if t.startswith(f"{plant_id}:")]:
             del self._created[task_id]
             if task_id not in known and task_id not in self._seen:
@@ -376,11 +392,11 @@ class Judge:
         if task.state in FINAL_STATES and seen.state not in FINAL_STATES:
             setattr(self.tally, task.state, getattr(self.tally, task.state) + 1)
         for entry in task.rounds:
-            if entry.winner and not (seen.state in FINAL_STATES and task.state == seen.state):
+            if entry.winner and (task.task_id, entry.epoch) not in self._rounds:
+                self._rounds.add((task.task_id, entry.epoch))
                 self._round(plant_id, task, entry)
         seen.epoch, seen.state = task.epoch, task.state
-        if task.state not in FINAL_STATES:
-            self._in_time(plant_id, task, seen)
+        (self._open[plant_id].discard if task.state in FINAL_STATES else self._open[plant_id].add)(task.task_id)
 
     def _in_time(self, plant_id: str, task: Task, seen: _Seen) -> None:
         """I5: time in which a capable robot could have done it."""
@@ -463,6 +479,8 @@ class Judge:
         """I10: the cheapest won, of those in the round and of those that came."""
         offers = [bid for bid in entry.bids if bid.cost_s is not None]
         won = next((bid for bid in offers if bid.robot_id == entry.winner), None)
+        if not self._same_life(plant_id):
+            return  # its times are those of a clock that is gone
         if won is None or won.cost_s is None:
             return self.breach("I10", f"{task.task_id} went to {entry.winner}, which offered nothing")
         best = min(offers, key=_price)
@@ -480,6 +498,12 @@ class Judge:
                 self.breach(
                     "I10", f"{task.task_id} went to {entry.winner}, though {heard.robot_id} offered {heard.cost_s:.1f} s"
                 )
+
+    def _same_life(self, plant_id: str) -> bool:
+        life = self.garden.running[plant_id].life
+        before = self._lives.setdefault(plant_id, life)
+        self._lives[plant_id] = life
+        return before is life
 
     def _loop_s(self, plant_id: str, garden_s: float) -> float:
         clock = self.garden.running[plant_id].life.clock

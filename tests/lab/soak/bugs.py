@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,12 +18,14 @@ from core.allocation.plant_side import Market
 from core.allocation.queue import Entry, TaskQueue
 from core.allocation.tasks import TaskBook
 from core.allocation.watering import Watering
-from core.errors import StorageError
+from core.errors import StorageError, Unprocessable
+from core.mesh.client import Mesh
 from plant_service.inventory import Fruits
 from plant_service.market import Marketplace
 from robot_service.body import gate
 from robot_service.body.caps import StopLatch
 from robot_service.body.pump import Doser
+from robot_service.brain import Brain
 from robot_service.scheduler import Scheduler
 
 BUGS: dict[str, Callable[[], Any]] = {}
@@ -154,6 +157,32 @@ def an_award_leaves_before_it_is_on_disk():
             await self._clock.sleep(5.0)
 
     with mock.patch.object(Marketplace, "_round", hasty):
+        yield
+
+
+@bug
+def a_repeated_award_is_keyed_and_differs():
+    """An award goes out under an Idempotency-Key; sent again after a restart, its words are others, and it is refused."""
+    real = Mesh.exchange
+
+    async def exchange(self, peer, method, path, body=b"", *, key="", **more):
+        if method == "POST" and path == "/tasks":
+            award = json.loads(body)
+            key = f"{award['announcement']['task_id']}/{award['epoch']}"
+        return await real(self, peer, method, path, body, key=key, **more)
+
+    with mock.patch.object(Mesh, "exchange", exchange):
+        yield
+
+
+@bug
+def a_kill_is_not_understood():
+    """The robot refuses a word of the protocol that it does not know."""
+
+    def kill(self, task_id, caller, epoch=None):
+        raise Unprocessable("no query parameter 'epoch'")
+
+    with mock.patch.object(Brain, "kill", kill):
         yield
 
 
