@@ -31,7 +31,7 @@ MULTIPLE_PX = 32
 """The network halves its input five times."""
 LONG_SIDE_PX = 512
 """Images are brought to this size first, so that fruit of a near and of a far camera look alike."""
-CONFIDENCE_MIN = 0.36
+CONFIDENCE_MIN = 0.38
 OVERLAP_MAX = 0.5
 """Two boxes that share more than this (intersection over union) are one fruit."""
 BALANCED_MEAN = 0.4

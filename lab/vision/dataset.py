@@ -144,11 +144,14 @@ def write(folder: Path, entries: Sequence[dict[str, Any]]) -> None:
 
 
 def split(photographs: Sequence[Photograph], seed: int = SPLIT_SEED, share: float = VALIDATION_SHARE) -> Split:
-    """Whole groups go to validation, drawn by `seed`, as many as fit into each folder's share of images."""
+    """Whole groups go to validation, drawn by `seed`, as many as fit into each folder's share of images.
+
+    Folders draw one after another in the order of their names, wherever they lie.
+    """
     rng = np.random.default_rng(seed)
     train: list[Photograph] = []
     validation: list[Photograph] = []
-    for folder in sorted({p.path.parent for p in photographs}):
+    for folder in sorted({p.path.parent for p in photographs}, key=lambda path: (path.parent.name, path)):
         mine = [p for p in photographs if p.path.parent == folder]
         groups = sorted({p.group for p in mine})
         wanted = round(share * len(mine))

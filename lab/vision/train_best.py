@@ -33,8 +33,6 @@ except ImportError as error:
 Array = NDArray[Any]
 Progress = Callable[[str], None]
 
-CYCLES = (2200, 4000)
-"""Steps while the rate falls to nothing, and again from where that ended (warm restarts: Loshchilov and Hutter 2017)."""
 BATCH = 8
 RATE = 2e-3
 WEIGHT_DECAY = 1e-4
@@ -55,8 +53,27 @@ class Trust:
     share: float = 1.0
 
 
-TRUST = {"kaggle_cc0": Trust(colour=0.7, ambiguous=0.2)}
-"""Folders whose colours were not labelled by hand."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cycle:
+    """So many steps while the rate rises to RATE and falls to nothing, without the folders of these names.
+
+    `margin_cells`: what lies this near to a fruit that may be found or not is not counted either.
+    """
+
+    steps: int
+    without: tuple[str, ...]
+    margin_cells: float
+
+
+CYCLES = (
+    Cycle(steps=2200, without=("rendered_wide",), margin_cells=0.5),
+    Cycle(steps=4000, without=("rendered_wide",), margin_cells=0.5),
+    Cycle(steps=2400, without=("rendered",), margin_cells=0.0),
+    Cycle(steps=2600, without=("rendered",), margin_cells=0.0),
+)
+"""Each goes on from where the one before ended (warm restarts: Loshchilov and Hutter 2017); the last sees more gardens."""
+TRUST = {"kaggle_cc0": Trust(colour=0.7, ambiguous=0.2), "rendered_wide": Trust(share=1.5)}
+"""Folders whose colours were not labelled by hand, and those that hold more to learn than others."""
 
 
 def train(data: Sequence[Path], out: Path | None, seed: int, progress: Progress) -> None:
@@ -93,10 +110,10 @@ def source(photograph: dataset.Photograph) -> str:
 def fitted(photographs: Sequence[dataset.Photograph], seed: int, progress: Progress) -> FruitNetwork:
     """The network after all cycles."""
     torch.manual_seed(seed)
-    scenes, weights = gathered(photographs)
     network: FruitNetwork = FruitNetwork().to(memory_format=torch.channels_last)
-    for cycle, steps in enumerate(CYCLES):
-        network = cycled(network, scenes, weights, steps, np.random.default_rng([seed, cycle]), progress)
+    for index, cycle in enumerate(CYCLES):
+        scenes, weights = gathered([p for p in photographs if source(p) not in cycle.without] or photographs)
+        network = cycled(network, scenes, weights, cycle, np.random.default_rng([seed, index]), progress)
     return network
 
 
@@ -104,7 +121,7 @@ def cycled(
     network: FruitNetwork,
     scenes: Sequence[augment.Scene],
     weights: Array,
-    steps: int,
+    cycle: Cycle,
     rng: np.random.Generator,
     progress: Progress,
 ) -> FruitNetwork:
@@ -112,11 +129,11 @@ def cycled(
     average: FruitNetwork = copy.deepcopy(network)
     network.train()
     optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=WEIGHT_DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps, pct_start=0.1)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=cycle.steps, pct_start=0.1)
     told: list[Array] = []
-    for step in range(steps):
+    for step in range(cycle.steps):
         batch = [augment.sample(scenes, weights, rng) for _ in range(BATCH)]
-        losses = losses_of(network, batch)
+        losses = losses_of(network, batch, cycle.margin_cells)
         optimiser.zero_grad()
         sum(losses).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 10.0)
@@ -127,9 +144,8 @@ def cycled(
         if (step + 1) % TELL_EVERY == 0:
             fruit, offset, size, colour = np.mean(told, 0)
             told.clear()
-            progress(
-                f"step {step + 1}/{steps}: fruit {fruit:.3f}, offset {offset:.3f}, size {size:.3f}, colour {colour:.3f}"
-            )
+            done = f"step {step + 1}/{cycle.steps}"
+            progress(f"{done}: fruit {fruit:.3f}, offset {offset:.3f}, size {size:.3f}, colour {colour:.3f}")
     return average
 
 
@@ -155,10 +171,10 @@ def follow(average: FruitNetwork, network: FruitNetwork, keep: float) -> None:
                 mean.copy_(now)
 
 
-def losses_of(network: FruitNetwork, batch: Sequence[augment.Sample]) -> tuple[Any, ...]:
+def losses_of(network: FruitNetwork, batch: Sequence[augment.Sample], margin_cells: float) -> tuple[Any, ...]:
     """Fruit (focal, Zhou et al. 2019, equation 1), offset, size (both absolute errors) and colour (cross entropy)."""
     images = torch.from_numpy(np.stack([best.planes(s.image) for s in batch])).contiguous(memory_format=torch.channels_last)
-    targets = torch.from_numpy(np.stack([target_maps(s) for s in batch]))
+    targets = torch.from_numpy(np.stack([target_maps(s, margin_cells) for s in batch]))
     maps = network(images)
     heat, counted, near = targets[:, 0], targets[:, 1], targets[:, 6]
     chance = torch.sigmoid(maps[:, 0]).clamp(1e-4, 1 - 1e-4)
@@ -180,7 +196,7 @@ def losses_of(network: FruitNetwork, batch: Sequence[augment.Sample]) -> tuple[A
     )
 
 
-def target_maps(sample: augment.Sample) -> Array:
+def target_maps(sample: augment.Sample, margin_cells: float) -> Array:
     """(9, h, w): centre heat; counted; offset right, down; log width, height; nearness; colour; trust in the colour.
 
     Larger fruit first, so that a small one before a large one keeps its cells.
@@ -192,7 +208,8 @@ def target_maps(sample: augment.Sample) -> Array:
     for k in np.argsort(-sample.boxes[:, 2:].prod(1), kind="stable"):
         u, v, w, h = sample.boxes[k] / best.STRIDE_PX
         if not sample.counted[k]:
-            maps[1][(np.abs(x - u) <= w / 2 + 0.5) & (np.abs(y - v) <= h / 2 + 0.5) & (maps[0] < 0.3)] = 0
+            within = (np.abs(x - u) <= w / 2 + margin_cells) & (np.abs(y - v) <= h / 2 + margin_cells)
+            maps[1][within & (maps[0] < 0.3)] = 0
             continue
         spread_x, spread_y = max(w * SPREAD, 0.5), max(h * SPREAD, 0.5)
         column, row = min(int(u), cells - 1), min(int(v), cells - 1)

@@ -94,6 +94,18 @@ def test_groups_are_never_divided_and_a_seed_gives_one_split(tmp_path):
     assert len(one.validation) == 30
 
 
+def test_the_split_is_the_same_wherever_the_folders_lie(tmp_path):
+    def kept(*folders):
+        photographs = [
+            dataset.Photograph(path=folder / "images" / f"{k}.png", boxes=(), group=f"{folder.name}/{k}")
+            for folder in folders
+            for k in range(40)
+        ]
+        return {p.group for p in dataset.split(photographs, 3).validation}
+
+    assert kept(tmp_path / "b" / "apples", tmp_path / "a" / "pears") == kept(tmp_path / "apples", tmp_path / "pears")
+
+
 def test_overlapping_photographs_are_one_group_and_others_are_not(tmp_path):
     rng = np.random.default_rng(11)
     scenes = [cv2.resize(rng.integers(0, 255, (30, 40, 3), np.uint8), (640, 480)) for _ in range(2)]
