@@ -30,7 +30,8 @@ SAME_FRUIT_M = 0.012
 """Two tracks nearer than this are one fruit: no two ripe fruit share so much room."""
 MEET_M = 0.02
 """Rays of one fruit pass each other nearer than this."""
-RADII_M = (0.006, 0.024)
+RADII_M = (0.002, 0.024)
+"""Of all that hangs, from just set to the largest."""
 TURNED_MIN, TURNED_RATIO = 6, 2.0
 """So many circles must agree with the pictures turned, and this many times more than without, to believe it."""
 ROUNDS, ROUNDS_PLAIN = 12, 4
