@@ -15,7 +15,7 @@ from core.clock import Clock
 from core.errors import GardenError
 from core.geometry.pinhole import NO_DISTORTION, Camera, undistort
 from core.perception.detection import Detection, Detector, Image
-from core.perception.registry import detector
+from core.perception.registry import keen_detector
 from core.wire.fruit import Accuracy
 from robot_service.failed import SkillFailed
 
@@ -53,6 +53,13 @@ class Look:
     image: Image
     detections: tuple[Detection, ...]
     stamp_s: float
+    sure_min: float = 0.0
+    """Confidence from which on a circle stands for itself; fainter ones count where a fruit is expected, or seen again."""
+
+    @property
+    def sure(self) -> tuple[Detection, ...]:
+        """The circles that stand for themselves."""
+        return tuple(circle for circle in self.detections if circle.confidence >= self.sure_min)
 
 
 class Eye:
@@ -63,6 +70,7 @@ class Eye:
     ) -> None:
         self._pictures, self._name, self._clock, self._lens = pictures, detector_name, clock, lens
         self._detector: Detector | None = None
+        self._sure_min = 0.0
         self.camera = replace(lens, distortion=NO_DISTORTION)
         """What the circles of a `Look` obey."""
         self.accuracy = accuracy or Accuracy()
@@ -88,7 +96,8 @@ class Eye:
             raise SkillFailed(f"the camera cannot be used: {error}") from error
         image = frame.image
         found = await self._clock.offload(lambda: self._detect(image), DETECT_COST_S)
-        self.last = Look(image=image, detections=tuple(map(self._straight, found)), stamp_s=frame.stamp_s)
+        circles = tuple(map(self._straight, found))
+        self.last = Look(image=image, detections=circles, stamp_s=frame.stamp_s, sure_min=self._sure_min)
         return self.last
 
     async def show(self) -> bytes:
@@ -102,7 +111,7 @@ class Eye:
 
     def _detect(self, image: Image) -> list[Detection]:
         if self._detector is None:
-            self._detector = detector(self._name)
+            self._detector, self._sure_min = keen_detector(self._name)
         return self._detector(image)
 
     def _straight(self, circle: Detection) -> Detection:
@@ -123,7 +132,7 @@ def drawn_jpeg(look: Look) -> bytes:
     import cv2
 
     picture = look.image.copy()
-    for circle in look.detections:
+    for circle in look.sure:
         centre = (round(circle.u_px), round(circle.v_px))
         cv2.circle(picture, centre, max(2, round(circle.radius_px)), _BGR[circle.colour], 2, cv2.LINE_AA)
         text = f"{circle.colour} {circle.confidence:.2f}"

@@ -34,6 +34,8 @@ RADII_M = (0.002, 0.024)
 """Of all that hangs, from just set to the largest."""
 TURNED_MIN, TURNED_RATIO = 6, 2.0
 """So many circles must agree with the pictures turned, and this many times more than without, to believe it."""
+FAINT_MIN = 0.6
+"""Faint circles make a fruit when several of them at one point are this convincing together."""
 ROUNDS, ROUNDS_PLAIN = 12, 4
 """Of Gauss-Newton: the first find the neighbourhood, in the rest an outlier loses its weight."""
 
@@ -125,8 +127,8 @@ def _residual(camera: Camera, T: Array, circle: Detection, x: Array, *, robust: 
     return J, gap, weights
 
 
-def fuse(camera: Camera, views: Sequence[View], radius_m: float = FRUIT_RADIUS_M) -> list[Seen]:
-    """The fruit of a whole scan, each once.
+def fuse(camera: Camera, views: Sequence[View], radius_m: float = FRUIT_RADIUS_M, sure_min: float = 0.0) -> list[Seen]:
+    """The fruit of a whole scan, each once. A circle less confident than `sure_min` does not stand for itself.
 
     Every pair of circles from two views whose rays meet proposes a point; the point that most views support takes its
     circles, then the next. What no other view supports stays alone, at the paper's depth.
@@ -139,9 +141,14 @@ def fuse(camera: Camera, views: Sequence[View], radius_m: float = FRUIT_RADIUS_M
         _settle(camera, views, track, radius_m)
     owned = {id(circle) for track in tracks for circle in track.hits.values()}
     for index, circle in circles:
-        if id(circle) not in owned and not _explained(camera, views, index, circle, tracks):
+        alone = circle.confidence >= sure_min and id(circle) not in owned
+        if alone and not _explained(camera, views, index, circle, tracks):
             tracks.append(_born(camera, index, views[index], circle, radius_m))
-    return [_seen(track) for track in _merged(tracks)]
+    return [_seen(track) for track in _merged(tracks) if _convincing(track, sure_min)]
+
+
+def _convincing(track: _Track, sure_min: float) -> bool:
+    return all(hit.confidence >= sure_min for hit in track.hits.values()) or _seen(track).confidence >= FAINT_MIN
 
 
 def upside_down(camera: Camera, views: Sequence[View]) -> bool:

@@ -32,6 +32,8 @@ MULTIPLE_PX = 32
 LONG_SIDE_PX = 512
 """Images are brought to this size first, so that fruit of a near and of a far camera look alike."""
 CONFIDENCE_MIN = 0.38
+KEEN_CONFIDENCE_MIN = 0.15
+"""For pictures of one plant from several places: what several of them show at one point is a fruit, however faint."""
 OVERLAP_MAX = 0.5
 """Two boxes that share more than this (intersection over union) are one fruit."""
 BALANCED_MEAN = 0.4
@@ -41,7 +43,16 @@ GAIN_RANGE = (0.3, 4.0)
 
 def best_detector() -> Detector:
     """The detector with its packaged weights; raises FileNotFoundError without them."""
-    return with_weights(importlib.resources.files("core.perception").joinpath(WEIGHTS).read_bytes())
+    return with_weights(_packaged())
+
+
+def keen_detector() -> tuple[Detector, float]:
+    """As `best_detector`, telling of fainter circles too, and the confidence from which on it would have told of one."""
+    return with_weights(_packaged(), KEEN_CONFIDENCE_MIN), CONFIDENCE_MIN
+
+
+def _packaged() -> bytes:
+    return importlib.resources.files("core.perception").joinpath(WEIGHTS).read_bytes()
 
 
 def with_weights(onnx: bytes, confidence_min: float = CONFIDENCE_MIN) -> Detector:

@@ -298,7 +298,7 @@ async def servo(robot: Robot, pitch_rad: float, target: Target, fruit: Fruit, pl
         look = await robot.eye.look()
         T_base_cam = camera_pose(joints_now(robot))
         mine = _told_apart(robot, look.detections, target, fruit.colour, near, T_base_cam)
-        _learn(robot, look.detections, mine, near, T_base_cam)
+        _learn(robot, look.sure, mine, near, T_base_cam)
         if (circle := mine.get(0)) is None:
             blind += 1
             if blind > BLIND_MAX:
@@ -426,7 +426,7 @@ async def _carry(task: Task, fruit: Fruit, way: Approach, target: Target, permit
     await task.keep_picture(permit, "after", after)
     held = feels(robot)
     T_base_cam = camera_pose(joints_now(robot))
-    still = best_match(robot, after.detections, _sharp(target), T_base_cam, fruit.colour)
+    still = best_match(robot, after.sure, _sharp(target), T_base_cam, fruit.colour)
     if not held:
         where = "it still hangs there" if still is not None else "it fell"
         await open_gripper(robot, way.opening_m)

@@ -33,11 +33,13 @@ async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Sc
     except Refused as error:
         raise SkillFailed(f"the arm cannot bring the camera before the plant: {error}") from error
     seen: list[tuple[Array, tuple[Detection, ...]]] = []
+    sure_min = 0.0
     for number, q in enumerate(poses):
         await _go(robot, q)
         look = await robot.eye.look()
         seen.append((camera_pose(joints_now(robot)), look.detections))
-        robot.activity.waiting = f"view {number + 1} of {len(poses)}: {len(look.detections)} fruit"
+        sure_min = look.sure_min
+        robot.activity.waiting = f"view {number + 1} of {len(poses)}: {len(look.sure)} fruit"
     robot.activity.waiting = ""
     # The base has stood still, and knows its place better with every marker.
     T_plant_base = np.linalg.inv(plant_in_base(robot.pose(), plant))
@@ -46,7 +48,7 @@ async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Sc
     camera = robot.eye.camera
     if await robot.clock.offload(lambda: upside_down(camera, views), 2 * FUSE_COST_S):
         raise SkillFailed("the pictures agree only when turned: the camera is mounted upside down")
-    fruit = await robot.clock.offload(lambda: fuse(camera, views), FUSE_COST_S)
+    fruit = await robot.clock.offload(lambda: fuse(camera, views, sure_min=sure_min), FUSE_COST_S)
     return document(robot, plant, scan_id, task_id, views, fruit)
 
 

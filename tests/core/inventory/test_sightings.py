@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -120,3 +121,24 @@ def test_a_camera_that_hangs_upside_down_is_noticed_and_an_upright_one_is_not_bl
     hanging = [View(T_plant_cam=T, detections=tuple(view)) for T, view in zip(POSES, turned, strict=True)]
     assert not upside_down(CAMERA, upright)
     assert upside_down(CAMERA, hanging)
+
+
+def faint(c: Detection, confidence: float) -> Detection:
+    return replace(c, confidence=confidence)
+
+
+def test_faint_circles_are_a_fruit_when_several_pictures_show_them_at_one_point() -> None:
+    p = np.array([0.47, 0.02, 0.55])
+    circles = [circle(p, 0.012, T, "green") for T in POSES]
+    views = [View(T_plant_cam=T, detections=(faint(c, 0.3),) if c else ()) for T, c in zip(POSES, circles, strict=True)]
+    (found,) = fuse(CAMERA, views, sure_min=0.36)
+    assert float(np.linalg.norm(found.p - p)) < 0.003
+    assert 0.6 < found.confidence < 1.0
+
+
+def test_a_faint_circle_that_stands_alone_is_none() -> None:
+    c = circle(np.array([0.47, 0.02, 0.55]), 0.012, POSES[3], "green")
+    assert c is not None
+    views = [View(T_plant_cam=T, detections=(faint(c, 0.3),) if i == 3 else ()) for i, T in enumerate(POSES)]
+    assert fuse(CAMERA, views, sure_min=0.36) == []
+    assert len(fuse(CAMERA, views, sure_min=0.25)) == 1
