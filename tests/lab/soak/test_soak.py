@@ -9,7 +9,7 @@ import pytest
 from lab.soak.cli import soak_all
 from lab.soak.run import Plan, as_json, soak
 
-FIXED = [Plan(seed=seed, days=1.0) for seed in range(1, 6)]
+FIXED = [Plan(seed=seed, days=1.0, hurry=0.3) for seed in range(1, 6)]
 
 
 def told(outcome):
@@ -21,8 +21,8 @@ def test_a_garden_day_under_faults_breaks_nothing(plan):
     print(plan.replay())
     outcome = soak(plan)
     assert not outcome.breaches, told(outcome)
-    assert outcome.tally.done >= 10
-    assert sum(outcome.faults.values()) >= 100
+    assert outcome.tally.done >= 8
+    assert sum(outcome.faults.values()) >= 50
 
 
 def _output(script, env):
