@@ -35,6 +35,8 @@ SHIFT_PAIRS_MIN = 4
 """So many fruit tell by how much the whole scan is off."""
 AGAIN = 0.35
 """Views of one scan see the same leaves and lights: each further one tells this part of what the first told."""
+THERE_M = 0.03
+"""A fruit hangs where it is said to when it is nearer than this; believed no more than its place is known."""
 SEEN_PRIOR, UNSEEN_PRIOR = 0.5, 0.8
 """Of the chance to see a fruit from a direction, before anything is known: beta distribution."""
 EYE_M = 0.06
@@ -42,8 +44,8 @@ EYE_M = 0.06
 EYES_MAX = 24
 LONE_RATIO = 0.05
 """Of the circles of fruit, so few are the only one of a fruit that several views had in their pictures (counted with two
-detectors: 0 of 70 and 2 of 130). False circles nearly all stand alone, so one view alone is weak evidence of a new fruit,
-and so is the edge of the only picture that could show it."""
+detectors: 0 of 70 and 2 of 130). False circles nearly all stand alone, so one view of several is weak evidence of a new
+fruit, also where no other looks (few fruit hang there), and so is the edge of a single picture."""
 ODDS_MISSED_MIN = -2.5
 """One scan alone does not count for more against a fruit: branches move."""
 FLOOR = 0.20
@@ -230,14 +232,16 @@ def _found(track: Track, seen: Sighting, scan: Scan, others: Sequence[Track], no
     moved = {
         axis: getattr(fruit, axis) + trust * (getattr(seen, axis) - getattr(fruit, axis)) for axis in ("x_m", "y_m", "z_m")
     }
-    confidence = probability(logit(fruit.confidence) + max(0.0, _evidence(seen, scan.detector)))
+    # The same view again guesses the same distance: it makes the place no surer.
+    sigma_m = math.sqrt(var * (1.0 - trust)) if _from_elsewhere(track, seen, scan) else min(fruit.sigma_m, seen.sigma_m)
+    odds = logit(fruit.confidence) + max(0.0, _evidence(seen, scan.detector))
     trust_radius = 1.0 / (1.0 + min(4, fruit.seen_count))
     after = track.with_fruit(
         **moved,
-        sigma_m=max(SIGMA_M_MIN, math.sqrt(var * (1.0 - trust))),
+        sigma_m=max(SIGMA_M_MIN, sigma_m),
         radius_m=fruit.radius_m + trust_radius * (seen.radius_m - fruit.radius_m),
         ripeness=seen.ripeness if seen.ripeness is not None else fruit.ripeness,
-        confidence=confidence,
+        confidence=min(probability(odds), _there(sigma_m)),
         robot_pose=seen.robot_pose,
         image_x_px=seen.image_x_px,
         image_y_px=seen.image_y_px,
@@ -250,6 +254,19 @@ def _found(track: Track, seen: Sighting, scan: Scan, others: Sequence[Track], no
     observed = Observation(t_s=now_s, colour=seen.colour, radius_m=seen.radius_m, ripeness=seen.ripeness)
     eyes = _looked(after, scan.views, seen.views)
     return _try_again(after.model_copy(update={"seen": remember(track.seen, observed), "eyes": eyes, "blind_scans": 0}))
+
+
+def _there(sigma_m: float) -> float:
+    """The chance that a fruit whose place is known so well is within `THERE_M` of it, along the least known direction."""
+    return math.erf(THERE_M / (max(sigma_m, SIGMA_M_MIN) * math.sqrt(2.0)))
+
+
+def _from_elsewhere(track: Track, seen: Sighting, scan: Scan) -> bool:
+    """Whether a view shows it that did not before, or several do at once."""
+    if len(seen.views) > 1:
+        return True
+    eyes = [_eye(track.eyes, scan.views[index]) for index in seen.views if index < len(scan.views)]
+    return any(eye is None or eye.seen == 0 for eye in eyes)
 
 
 def _try_again(track: Track) -> Track:
@@ -296,10 +313,11 @@ def _fresh(fruit_id: str, sighting: Sighting, scan: Scan, now_s: float) -> Track
     chance = SEEN_PRIOR / (SEEN_PRIOR + UNSEEN_PRIOR)
     odds = _evidence(sighting, scan.detector) + _against([chance] * len(unseen), scan.detector)
     alone = len(sighting.views) == 1
-    if alone and (unseen or not in_view(scan.views[sighting.views[0]], track.p)):
+    if alone and (len(scan.views) > 1 or not in_view(scan.views[sighting.views[0]], track.p)):
         odds += math.log(LONE_RATIO)
     eyes = _looked(track, scan.views, sighting.views)
-    return track.with_fruit(confidence=probability(odds)).model_copy(update={"eyes": eyes})
+    confidence = min(probability(odds), _there(sighting.sigma_m))
+    return track.with_fruit(confidence=confidence).model_copy(update={"eyes": eyes})
 
 
 def _ripened(track: Track, colour: str, now_s: float) -> Track:

@@ -292,3 +292,15 @@ def test_what_one_picture_shows_at_its_edge_is_doubted_and_goes_when_it_is_not_s
     plant.fruit = []
     left = [entry for _ in range(3) for entry in plant.scan().left]
     assert [entry.fruit_id for entry in left] == ["f1"]
+
+
+def test_a_scan_of_one_picture_is_believed_but_at_its_edge() -> None:
+    middle, edge = (0.1, 0.0, 0.12), (0.1, 0.0, 0.12 + 0.35 * math.tan(0.67))
+    seen = [
+        Sighting(x_m=x, y_m=y, z_m=z, sigma_m=0.01, radius_m=0.013, colour="red", confidence=0.9, views=[0])
+        for x, y, z in (middle, edge)
+    ]
+    scan = Scan(scan_id="one", views=[view((0.45, 0.0, 0.12))], sightings=seen)
+    tracks = merge([], scan, Pace(), 1000.0, iter("ab").__next__).tracks
+    sure, doubted = (track.fruit.confidence for track in sorted(tracks, key=lambda track: track.p[2]))
+    assert doubted < 0.6 < 0.8 < sure
