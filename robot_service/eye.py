@@ -15,11 +15,11 @@ from core.clock import Clock
 from core.errors import GardenError
 from core.geometry.pinhole import NO_DISTORTION, Camera, undistort
 from core.perception.detection import Detection, Detector, Image
-from core.perception.registry import keen_detector
+from core.perception.registry import keen_detectors
 from core.wire.fruit import Accuracy
 from robot_service.failed import SkillFailed
 
-DETECT_COST_S = 0.06
+DETECT_COST_S, FINE_COST_S = 0.06, 0.22
 JPEG_COST_S = 0.01
 JPEG_QUALITY = 80
 SHOW_EVERY_S = 0.5
@@ -69,8 +69,7 @@ class Eye:
         self, pictures: Pictures | None, detector_name: str, lens: Camera, clock: Clock, accuracy: Accuracy | None = None
     ) -> None:
         self._pictures, self._name, self._clock, self._lens = pictures, detector_name, clock, lens
-        self._detector: Detector | None = None
-        self._sure_min = 0.0
+        self._detectors: tuple[Detector, Detector, float] | None = None
         self.camera = replace(lens, distortion=NO_DISTORTION)
         """What the circles of a `Look` obey."""
         self.accuracy = accuracy or Accuracy()
@@ -83,8 +82,11 @@ class Eye:
         """Whether there is a camera at all."""
         return self._pictures is not None
 
-    async def look(self) -> Look:
-        """A picture taken from now on, with its fruit. Raises SkillFailed when the camera gives none that can be used."""
+    async def look(self, *, fine: bool = False) -> Look:
+        """A picture taken from now on, with its fruit; `fine` takes longer and finds smaller ones.
+
+        Raises SkillFailed when the camera gives none that can be used.
+        """
         if self._pictures is None:
             raise SkillFailed("this robot has no camera")
         try:
@@ -95,9 +97,11 @@ class Eye:
         except GardenError as error:
             raise SkillFailed(f"the camera cannot be used: {error}") from error
         image = frame.image
-        found = await self._clock.offload(lambda: self._detect(image), DETECT_COST_S)
+        found, sure_min = await self._clock.offload(
+            lambda: self._detect(image, fine=fine), FINE_COST_S if fine else DETECT_COST_S
+        )
         circles = tuple(map(self._straight, found))
-        self.last = Look(image=image, detections=circles, stamp_s=frame.stamp_s, sure_min=self._sure_min)
+        self.last = Look(image=image, detections=circles, stamp_s=frame.stamp_s, sure_min=sure_min)
         return self.last
 
     async def show(self) -> bytes:
@@ -109,10 +113,11 @@ class Eye:
                 self._shown = self._clock.now(), await self._clock.offload(lambda: drawn_jpeg(look), JPEG_COST_S)
             return self._shown[1]
 
-    def _detect(self, image: Image) -> list[Detection]:
-        if self._detector is None:
-            self._detector, self._sure_min = keen_detector(self._name)
-        return self._detector(image)
+    def _detect(self, image: Image, *, fine: bool) -> tuple[list[Detection], float]:
+        if self._detectors is None:
+            self._detectors = keen_detectors(self._name)
+        quick, finer, sure_min = self._detectors
+        return (finer if fine else quick)(image), sure_min
 
     def _straight(self, circle: Detection) -> Detection:
         """The circle where a lens without distortion would have put it."""

@@ -36,7 +36,7 @@ async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Sc
     sure_min = 0.0
     for number, q in enumerate(poses):
         await _go(robot, q)
-        look = await robot.eye.look()
+        look = await robot.eye.look(fine=True)
         seen.append((camera_pose(joints_now(robot)), look.detections))
         sure_min = look.sure_min
         robot.activity.waiting = f"view {number + 1} of {len(poses)}: {len(look.sure)} fruit"

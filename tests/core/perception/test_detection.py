@@ -6,7 +6,7 @@ import pytest
 
 from core.errors import ConfigError
 from core.perception.detection import Box, Counts, Detection, match, score, total
-from core.perception.registry import detector, keen_detector
+from core.perception.registry import detector, keen_detectors
 
 
 def at(u, v, colour="red", confidence=0.9):
@@ -80,6 +80,6 @@ def test_an_unknown_detector_is_refused_with_what_would_work(name):
 
 
 def test_only_a_detector_that_tells_of_faint_circles_says_which_stand_for_themselves() -> None:
-    _, sure_min = keen_detector("best")
+    *_, sure_min = keen_detectors("best")
     assert 0.0 < sure_min < 1.0
-    assert keen_detector("filter")[1] == 0.0
+    assert keen_detectors("filter")[2] == 0.0
