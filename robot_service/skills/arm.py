@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 
 from core.errors import Refused
-from core.manipulation.approach import RETREAT_M, along
+from core.manipulation.approach import along
 from core.manipulation.arm import Joints, hand_point, inverse, nozzle_goal
 from core.manipulation.swing import Leg, fold, leg_s, swing
 from core.robots import gardener
@@ -19,7 +19,7 @@ SETTLE_S = 0.3
 LEG_LATE_S = 5.0
 IN_PLANT_M = 0.2
 """A hand nearer to the stem than this is among leaves and fruit."""
-WITHDRAW_STEPS, WITHDRAW_SHARE = 3, 0.15
+WITHDRAW_M, WITHDRAW_STEPS, WITHDRAW_SHARE = 0.15, 5, 0.15
 NEAR_RAD = 0.03
 """The board tells its pulses to 10 us, which is half of this."""
 
@@ -85,7 +85,7 @@ async def withdraw(robot: Robot) -> None:
     legs = []
     for number in range(1, WITHDRAW_STEPS + 1):
         try:
-            back = inverse(along(tool, pitch_rad, number * RETREAT_M / WITHDRAW_STEPS), pitch_rad)
+            back = inverse(along(tool, pitch_rad, number * WITHDRAW_M / WITHDRAW_STEPS), pitch_rad)
         except Refused:
             break
         legs.append(Leg(q=back, duration_s=leg_s(q, back, WITHDRAW_SHARE, least_s=0.1)))
@@ -97,6 +97,7 @@ async def reach(robot: Robot, point_base_m: tuple[float, float, float]) -> Joint
     """Bring the nozzle to a point in the base frame; returns the joints held there. An arm of unknown place folds first."""
     if robot.state().arm_rad is None:
         await fold_arm(robot)
+    await withdraw(robot)
     try:
         goal = nozzle_goal(point_base_m)
         legs = swing(joints_now(robot), goal)

@@ -34,6 +34,8 @@ async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Sc
         raise SkillFailed(f"the arm cannot bring the camera before the plant: {error}") from error
     seen: list[tuple[Array, tuple[Detection, ...]]] = []
     sure_min = 0.0
+    # A brain before this one may have left the hand among the fruit.
+    await fold_arm(robot)
     for number, q in enumerate(poses):
         await _go(robot, q)
         look = await robot.eye.look(fine=True)
