@@ -29,13 +29,15 @@ STRIDE_PX = 4
 SIZE_UNIT_PX = 32.0
 MULTIPLE_PX = 32
 """The network halves its input five times."""
-LONG_SIDE_PX = 512
+LONG_SIDE_PX = 640
 """Images are brought to this size first, so that fruit of a near and of a far camera look alike."""
-CONFIDENCE_MIN = 0.38
+CONFIDENCE_MIN = 0.40
+COLOUR_LOGIT = (0.3, 0.0, 0.0)
+"""Added to the network's word for green, turning, red: green fruit among leaves look faint to it more often than not."""
 KEEN_CONFIDENCE_MIN = 0.15
 """For pictures of one plant from several places: what several of them show at one point is a fruit, however faint."""
-FINE_LONG_SIDE_PX = 960
-"""For small fruit, where a fifth of a second does not matter: enlarged, they are of a size that the network knows well."""
+QUICK_LONG_SIDE_PX, FINE_LONG_SIDE_PX = 512, 960
+"""For a hand that waits before the fruit; and for small fruit, where a fifth of a second does not matter."""
 OVERLAP_MAX = 0.5
 """Two boxes that share more than this (intersection over union) are one fruit."""
 BALANCED_MEAN = 0.4
@@ -51,11 +53,11 @@ def best_detector() -> Detector:
 def keen_detectors() -> tuple[Detector, Detector, float]:
     """Two that tell of fainter circles too, and the confidence from which on a circle stands for itself.
 
-    The first is as quick as `best_detector`; the second has finer sight and takes four times as long.
+    The first is quick; the second has finer sight and takes four times as long.
     """
     onnx = _packaged()
     fine = with_weights(onnx, KEEN_CONFIDENCE_MIN, FINE_LONG_SIDE_PX)
-    return with_weights(onnx, KEEN_CONFIDENCE_MIN), fine, CONFIDENCE_MIN
+    return with_weights(onnx, KEEN_CONFIDENCE_MIN, QUICK_LONG_SIDE_PX), fine, CONFIDENCE_MIN
 
 
 def _packaged() -> bytes:
@@ -129,18 +131,19 @@ def decode(maps: Array, confidence_min: float = CONFIDENCE_MIN) -> tuple[Array, 
 
     The surest first. A peak is a cell that none of its eight neighbours exceeds.
     """
-    fruit = maps[0]
+    fruit = maps[0] + np.asarray(COLOUR_LOGIT, np.float32)[maps[5:8].argmax(0)]
     floor = np.log(confidence_min / (1 - confidence_min))
     peaks = (fruit >= floor) & (fruit >= cv2.dilate(fruit, np.ones((3, 3), np.uint8)))
     rows, columns = np.nonzero(peaks)
     order = np.argsort(-fruit[rows, columns], kind="stable")
     rows, columns = rows[order], columns[order]
+    logits = fruit[rows, columns]
     cells = maps[:, rows, columns]
     u = (columns + 0.5 + cells[1]) * STRIDE_PX
     v = (rows + 0.5 + cells[2]) * STRIDE_PX
     sizes = np.exp(np.clip(cells[3:5], -4, 4)) * SIZE_UNIT_PX
     boxes = np.stack([u, v, sizes[0], sizes[1]], 1).astype(np.float32)
-    return boxes, (1 / (1 + np.exp(-cells[0]))).astype(np.float32), cells[5:8].argmax(0)
+    return boxes, (1 / (1 + np.exp(-logits))).astype(np.float32), cells[5:8].argmax(0)
 
 
 def distinct(boxes: Array, confidences: Array, overlap_max: float = OVERLAP_MAX) -> list[int]:

@@ -70,6 +70,7 @@ CYCLES = (
     Cycle(steps=4000, without=("rendered_wide",), margin_cells=0.5),
     Cycle(steps=2400, without=("rendered",), margin_cells=0.0),
     Cycle(steps=2600, without=("rendered",), margin_cells=0.0),
+    Cycle(steps=3200, without=("rendered",), margin_cells=0.0),
 )
 """Each goes on from where the one before ended (warm restarts: Loshchilov and Hutter 2017); the last sees more gardens."""
 TRUST = {"kaggle_cc0": Trust(colour=0.7, ambiguous=0.2), "rendered_wide": Trust(share=1.5)}

@@ -47,7 +47,8 @@ def painted():
 def test_a_peak_is_read_where_it_is_with_its_size_and_colour():
     boxes, confidences, colours = best.decode(maps_with([(3, 5, 0.8, 40, 20, 2), (20, 30, 0.6, 10, 12, 0)]))
     np.testing.assert_allclose(boxes, [[22, 14, 40, 20], [122, 82, 10, 12]], rtol=1e-5)
-    np.testing.assert_allclose(confidences, [0.8, 0.6], rtol=1e-5)
+    fainter_green = 1 / (1 + (1 / 0.6 - 1) * np.exp(-best.COLOUR_LOGIT[0]))
+    np.testing.assert_allclose(confidences, [0.8, fainter_green], rtol=1e-5)
     assert colours.tolist() == [2, 0]
 
 
