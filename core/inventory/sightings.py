@@ -32,6 +32,8 @@ MEET_M = 0.02
 """Rays of one fruit pass each other nearer than this."""
 RADII_M = (0.002, 0.024)
 """Of all that hangs, from just set to the largest."""
+RIPENING_RADIUS_M_MIN = 0.009
+"""Fruit turn when they are full-grown, even the smallest of a truss: smaller red ones are crossed rays."""
 TURNED_MIN, TURNED_RATIO = 6, 2.0
 """So many circles must agree with the pictures turned, and this many times more than without, to believe it."""
 FAINT_MIN = 0.6
@@ -223,7 +225,8 @@ def _proposals(camera: Camera, views: Sequence[View], circles: Sequence[tuple[in
     ra, rb = ta * angles[a], tb * angles[b]
     radii = np.sqrt(np.maximum(ra * rb, 1e-12))
     near = (ta > 0.05) & (tb > 0.05) & (np.linalg.norm(pa - pb, axis=1) < MEET_M)
-    fits = (radii > RADII_M[0]) & (radii < RADII_M[1]) & (np.abs(np.log(np.maximum(ra, 1e-6) / np.maximum(rb, 1e-6))) < 0.6)
+    least = np.where(np.maximum(colour_of[a], colour_of[b]) > 0, RIPENING_RADIUS_M_MIN, RADII_M[0])
+    fits = (radii > least) & (radii < RADII_M[1]) & (np.abs(np.log(np.maximum(ra, 1e-6) / np.maximum(rb, 1e-6))) < 0.6)
     good = near & fits
     return (0.5 * (pa + pb))[good], radii[good]
 
