@@ -12,8 +12,9 @@ import json
 import math
 import random
 from collections import Counter, defaultdict
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from pathlib import Path
+from typing import Any
 
 from core.mesh.client import Answer
 from lab.soak.garden import Hooks, Running, SoakGarden
@@ -104,15 +105,15 @@ class Gremlin:
             await asyncio.sleep(CALM_S)
 
     async def _one(self) -> None:
-        kinds: list[Callable[[], Awaitable[None]]] = [
+        kinds: list[Callable[[], Coroutine[Any, Any, None]]] = [
             self._storm, self._storm, self._storm, self._cut, self._partition, self._crash, self._crash, self._crash,
             self._pause, self._pause, self._arm_disk, self._arm_disk, self._battery, self._pump, self._tap, self._probe,
             self._power_cycle,
         ]  # fmt: skip
         self._later(self.rng.choice(kinds)())
 
-    def _later(self, work: Awaitable[None]) -> None:
-        task = asyncio.get_running_loop().create_task(_await(work), context=self._context.copy())
+    def _later(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work, context=self._context.copy())
         self._healing.add(task)
         task.add_done_callback(self._healing.discard)
 
@@ -369,10 +370,6 @@ class Gremlin:
     def _clock(self, name: str) -> NodeClock:
         self.counts["clock_skew"] += 1
         return skewed(self.rng)
-
-
-async def _await(work: Awaitable[None]) -> None:
-    await work
 
 
 def _named(message: Message, answer: Answer | None) -> str:
