@@ -9,16 +9,14 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from core.allocation.picking import may_be_picked
 from core.errors import GardenError, Refused
 from core.mesh.client import Mesh
 from core.mesh.peers import Peer
-from core.wire.fruit import Forecast, Fruit, Inventory
+from core.wire.fruit import Forecast, Inventory
 from core.wire.market import FINAL_STATES, Task, TaskRequest
 from core.wire.order import Order, OrderPart, OrderRequest, OrderState
 
-RIPE_CONFIDENCE_MIN = 0.6
-SIGMA_M_MAX = 0.03
-"""A hand finds no fruit that is known less well than this: one view alone saw it, and often it is none."""
 PER_TASK_MAX = 64
 Send = Callable[[Peer, TaskRequest], Awaitable[Task]]
 """Posts a task at a pot with the right token."""
@@ -63,14 +61,9 @@ def _stock(inventory: Inventory | GardenError, hope: Forecast | GardenError, tas
     if isinstance(inventory, GardenError):
         return Stock(0, why=str(inventory)[:200])
     promised = {name for task in tasks if _stands(task) for name in task.fruit_ids} if isinstance(tasks, list) else set()
-    ripe = [fruit for fruit in inventory.fruits if fruit.fruit_id not in promised and _may_be_picked(fruit)]
+    ripe = [fruit for fruit in inventory.fruits if fruit.fruit_id not in promised and may_be_picked(fruit)]
     never = "was never scanned" if inventory.scanned_s is None and not inventory.fruits else ""
     return Stock(len(ripe), 0.0 if isinstance(hope, GardenError) else hope.ripe, never)
-
-
-def _may_be_picked(fruit: Fruit) -> bool:
-    sure = fruit.confidence >= RIPE_CONFIDENCE_MIN and fruit.sigma_m <= SIGMA_M_MAX
-    return sure and not (fruit.unreachable or fruit.failed or fruit.in_doubt)
 
 
 def _stands(task: Task) -> bool:

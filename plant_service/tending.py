@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from starlette.responses import Response
 
+from core.allocation.picking import may_be_picked
 from core.clock import Clock
 from core.errors import Conflict, Refused
 from core.growth.forecast import forecast, uncertainty
@@ -25,9 +26,6 @@ from plant_service.ledger import Ledger
 from plant_service.market import Marketplace
 from plant_service.shelf import Shelf
 
-RIPE_CONFIDENCE_MIN = 0.6
-SIGMA_M_MAX = 0.03
-"""A hand finds no fruit that is known less well than this: one view alone saw it, and often it is none."""
 KEEP_RIPE, KEEP_RIPE_S = 2, 6 * 3600.0
 """So many ripe fruit are left for people who order some, for so long: a pot asks for all others to be picked at once."""
 AFTER_FAILURE_S = 1800.0
@@ -68,7 +66,7 @@ class Tending:
 
     def ripe(self) -> list[Fruit]:
         """Fruit to pick, those that hang furthest out towards the dock first: reaching past a neighbour tears it off."""
-        fruits = [f for f in self._fruits.machine.inventory.fruits if f.colour == "red" and _may_be_picked(f)]
+        fruits = [f for f in self._fruits.machine.inventory.fruits if f.colour == "red" and may_be_picked(f)]
         return sorted(fruits, key=lambda fruit: (-fruit.x_m, fruit.fruit_id))
 
     # What robots tell
@@ -232,8 +230,3 @@ class Tending:
 
     def _open_lines(self) -> list[LedgerLine]:
         return [line for line in self.ledger.lines() if line.outcome == "permitted"]
-
-
-def _may_be_picked(fruit: Fruit) -> bool:
-    sure = fruit.confidence >= RIPE_CONFIDENCE_MIN and fruit.sigma_m <= SIGMA_M_MAX
-    return sure and not (fruit.unreachable or fruit.failed or fruit.in_doubt)

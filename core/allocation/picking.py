@@ -15,6 +15,15 @@ from core.wire.market import Permit, Task
 
 PICK_S_MAX = 60.0
 """The longest a pick may take once begun: grasp, pull, look, basket."""
+RIPE_CONFIDENCE_MIN = 0.6
+SIGMA_M_MAX = 0.03
+"""A hand finds no fruit that is known less well than this: one view alone saw it, and often it is none."""
+
+
+def may_be_picked(fruit: Fruit) -> bool:
+    """Whether a hand may be sent for it, by what its plant knows; its colour is not asked."""
+    sure = fruit.confidence >= RIPE_CONFIDENCE_MIN and fruit.sigma_m <= SIGMA_M_MAX
+    return sure and not (fruit.unreachable or fruit.failed or fruit.in_doubt)
 
 
 class OpenPick(Document):
