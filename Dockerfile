@@ -13,7 +13,7 @@ ENV SSL_CERT_FILE=/etc/ssl/certs/ca-certificates.crt \
 WORKDIR /src
 RUN pip install --no-cache-dir "uv>=0.9,<1"
 COPY pyproject.toml uv.lock README.md LICENSE ./
-RUN uv sync --frozen --no-install-project
+RUN uv sync --frozen --no-install-project --extra discovery
 COPY core core
 COPY hw hw
 COPY sim sim
@@ -22,7 +22,7 @@ COPY robot_service robot_service
 COPY console console
 COPY lab lab
 COPY scenarios scenarios
-RUN uv sync --frozen --no-editable
+RUN uv sync --frozen --no-editable --extra discovery
 WORKDIR /
 RUN mkdir -p /opt/numba \
     && /opt/garden/bin/python -m console.warm \

@@ -15,6 +15,7 @@ from core.mesh.chassis import create_app
 from core.mesh.client import Mesh, PeerTransport
 from core.mesh.node import Node
 from core.mesh.peers import Peers
+from core.mesh.presence import add_presence, introducer
 from core.store import Disk, DurableDocument
 from core.wire.plant import SettingsPatch
 from hw.drivers.probes import open_probe, open_valve
@@ -67,9 +68,12 @@ def build(
     journal = Journal(settings.id, settings.folder / "history.sqlite3", clock)
     maker = build_pot if settings.kind == "pot" else build_station
     mesh = Mesh(transport, identity, clock)
-    parts = _Parts(settings, clock, opener, mesh, verifier, peers or Peers(), journal, open_reads, disk)
+    peers = peers if peers is not None else Peers()
+    parts = _Parts(settings, clock, opener, mesh, verifier, peers, journal, open_reads, disk)
     parts.probes, parts.valves = probes, valves
-    return maker(parts)
+    node = maker(parts)
+    add_presence(node.app, peers, clock, introducer(identity, node.kind, settings.url))
+    return node
 
 
 class _Parts:
@@ -130,7 +134,8 @@ def build_pot(parts: _Parts) -> Node:
     )  # fmt: skip
     api.add_pot(app, pot)
     app.state.pot = pot
-    return Node(settings.id, "plant", app, (probe.run, pot.watch, _closing(place.run, keepers), journal.run))
+    loops = (probe.run, pot.watch, _closing(place.run, keepers), journal.run)
+    return Node(settings.id, "plant", app, loops, settings.url)
 
 
 def build_station(parts: _Parts) -> Node:
@@ -149,7 +154,7 @@ def build_station(parts: _Parts) -> Node:
     loops: list[Loop] = [_closing(journal.run, keepers)]
     if valve is not None:
         loops.append(valve.run)
-    return Node(settings.id, "station", app, tuple(loops))
+    return Node(settings.id, "station", app, tuple(loops), settings.url)
 
 
 def _tell_alarms(keepers: tuple[Keeper, ...], journal: Journal) -> None:  # type: ignore[type-arg]

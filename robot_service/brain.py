@@ -18,6 +18,7 @@ from core.mesh.client import Mesh, PeerTransport
 from core.mesh.events import EventLog
 from core.mesh.node import Node
 from core.mesh.peers import Peers
+from core.mesh.presence import add_presence, introducer
 from core.robots import gardener
 from core.robots.markers import ceiling_markers
 from core.wire.body import BodyState
@@ -369,10 +370,12 @@ def build(
     lens = from_fov(*gardener.CAMERA_PIXELS, math.radians(gardener.CAMERA_FOV_Y_DEG))
     camera = open_camera(settings.camera_url, clock, cameras) if settings.camera_url else None
     eye = eye or Eye(camera, settings.detector, lens, clock)
-    brain = Brain(settings, clock, opener, mesh, peers if peers is not None else Peers(), rng, eye, hand)
+    peers = peers if peers is not None else Peers()
+    brain = Brain(settings, clock, opener, mesh, peers, rng, eye, hand)
     app = make_app(brain, verifier, open_reads)
+    add_presence(app, peers, clock, introducer(identity, "robot", settings.url))
     app.state.brain = brain
     loops = [brain.body.run, brain.robot.neighbours.run, brain.docks.run, brain.reporter.run, brain.scheduler.run]
     if camera is not None:
         loops.append(camera.run)
-    return Node(id=settings.id, kind="robot", app=app, loops=tuple(loops))
+    return Node(id=settings.id, kind="robot", app=app, loops=tuple(loops), url=settings.url)

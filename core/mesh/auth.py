@@ -11,7 +11,7 @@ import hashlib
 import os
 import secrets
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,21 +43,36 @@ ANYBODY = Caller("anybody", "operator")
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a node sends with every request."""
+    """What a node sends with every request, and what it proves itself with to those who do not know it yet."""
 
     subject: str
     role: str
     token: str
+    card: str = ""
+    """The garden's word that `key` is this node's. No token: whoever reads it can do nothing with it."""
+    key: Ed25519PrivateKey | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def load(cls, folder: Path) -> Identity:
-        """Read `folder/token`; raises ConfigError when it is not there or not a token."""
+        """Read `folder/token`, and `card` and `node.key` where they are; raises ConfigError when there is no token."""
         token = _read(folder / "token").decode("ascii", "replace").strip()
+        card, key = "", None
+        if (folder / "card").exists() and (folder / "node.key").exists():
+            card, key = _read(folder / "card").decode("ascii", "replace").strip(), GardenKey.load(folder / "node.key").key
         try:
             claims = jwt.decode(token, options={"verify_signature": False})
-            return cls(str(claims["sub"]), str(claims["role"]), token)
+            return cls(str(claims["sub"]), str(claims["role"]), token, card, key)
         except (jwt.InvalidTokenError, KeyError) as error:
             raise ConfigError(f"{folder / 'token'} holds no token", hint="run `garden init`") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """Whose key a verified card names."""
+
+    subject: str
+    role: str
+    key: Ed25519PublicKey
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +111,33 @@ class GardenKey:
         claims |= {"exp": int(now_s + life_s)} | more
         return Identity(subject, role, jwt.encode(claims, self.key, algorithm="EdDSA"))
 
+    def card(self, subject: str, role: str, key: Ed25519PublicKey, now_s: float, life_s: float = TOKEN_LIFE_S) -> str:
+        """Sign that `key` is the own key of the node `subject`. Of another audience than tokens, it opens nothing."""
+        claims = {"sub": subject, "role": role, "aud": _card_audience(self.public()), "iat": int(now_s)}
+        claims |= {"exp": int(now_s + life_s), "cnf": _confirmation(key)}
+        return jwt.encode(claims, self.key, algorithm="EdDSA")
+
     def verifier(self) -> Verifier:
         return Verifier(self.public())
+
+
+def _card_audience(garden: Ed25519PublicKey) -> str:
+    return f"{audience(garden)}/card"
+
+
+def _confirmation(key: Ed25519PublicKey) -> dict[str, Any]:
+    """RFC 7800: the key whose holder is meant, as a JWK (RFC 8037)."""
+    x = base64.urlsafe_b64encode(key.public_bytes_raw()).rstrip(b"=").decode()
+    return {"jwk": {"kty": "OKP", "crv": "Ed25519", "x": x}}
+
+
+def _confirmed(claims: dict[str, Any]) -> Ed25519PublicKey:
+    """Raises Unauthorised when no key is named."""
+    try:
+        x = str(claims["cnf"]["jwk"]["x"])
+        return Ed25519PublicKey.from_public_bytes(base64.urlsafe_b64decode(x + "=" * (-len(x) % 4)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise Unauthorised("the card names no key") from error
 
 
 def audience(garden: Ed25519PublicKey) -> str:
@@ -138,25 +178,42 @@ class Verifier:
             self._remember(token, known)
         return caller
 
+    def card(self, card: object, now_s: float) -> Card:
+        """Whose key a card names; raises Unauthorised for any card that is not whole, ours and alive."""
+        if not isinstance(card, str):
+            raise Unauthorised("there is no card")
+        claims = self._claims(card, _card_audience(self._garden))
+        caller, expires_s = _caller(claims)
+        if now_s >= expires_s:
+            raise Unauthorised("the card has expired")
+        return Card(caller.subject, caller.role, _confirmed(claims))
+
     def _remember(self, token: str, known: tuple[Caller, float]) -> None:
         if len(self._known) >= _CACHE_MAX:
             self._known.pop(next(iter(self._known)))
         self._known[token] = known
 
     def _check(self, token: str) -> tuple[Caller, float]:
+        return _caller(self._claims(token, self._audience))
+
+    def _claims(self, token: str, audience: str) -> dict[str, Any]:
         if len(token) > _TOKEN_CHARS_MAX:
             raise Unauthorised("the token is too long", hint=_HINT)
         # PyJWT would hold the times against the operating system's clock; the garden's clock decides.
         options: Any = {"require": ["sub", "aud", "exp", "iat"], "verify_exp": False, "verify_iat": False}
         options["verify_nbf"] = False
         try:
-            claims = jwt.decode(token, self._garden, algorithms=["EdDSA"], audience=self._audience, options=options)
+            return jwt.decode(token, self._garden, algorithms=["EdDSA"], audience=audience, options=options)
         except (jwt.InvalidTokenError, ValueError) as error:
             raise Unauthorised(f"the token is not one of this garden: {error}", hint=_HINT) from error
-        subject, role, expires_s = claims["sub"], claims.get("role"), claims["exp"]
-        if role not in ROLES or isinstance(expires_s, bool) or not isinstance(expires_s, int | float):
-            raise Unauthorised("the token names no role or no time", hint=_HINT)
-        return Caller(str(subject), role), float(expires_s)
+
+
+def _caller(claims: dict[str, Any]) -> tuple[Caller, float]:
+    """Who is meant, and until when; raises Unauthorised."""
+    subject, role, expires_s = claims["sub"], claims.get("role"), claims["exp"]
+    if role not in ROLES or isinstance(expires_s, bool) or not isinstance(expires_s, int | float):
+        raise Unauthorised("the token names no role or no time", hint=_HINT)
+    return Caller(str(subject), role), float(expires_s)
 
 
 # ------------------------------------------------------------------------------------------------- key folders
@@ -175,7 +232,7 @@ class Enrolled:
 def make_garden(folder: Path, nodes: Iterable[Enrolled], now_s: float, life_s: float = TOKEN_LIFE_S) -> list[str]:
     """`garden init`: make whatever is missing below `folder`, and tell what was made. Never replaces a key.
 
-    Files: `garden.key` (0600) and `garden.pub`; for every node `ID/{node.key,token,garden.pub}`, for a robot also
+    Files: `garden.key` (0600) and `garden.pub`; for every node `ID/{node.key,token,card,garden.pub}`, for a robot also
     `ID/body.secret`; `operator/` and `viewer/` with a token each.
     """
     made: list[str] = []
@@ -202,20 +259,23 @@ def _enrol(folder: Path, node: Enrolled, garden: GardenKey, now_s: float, life_s
         _write(key_path, _private_pem(Ed25519PrivateKey.generate()))
     if node.secret and not (folder / "body.secret").exists():
         _write(folder / "body.secret", secrets.token_hex(32).encode())
-    if token_path.exists() and _alive(token_path, garden, now_s):
+    if token_path.exists() and _alive(folder, garden, now_s):
         return False
-    public = GardenKey.load(key_path).public().public_bytes_raw()
-    x = base64.urlsafe_b64encode(public).rstrip(b"=").decode()
-    # RFC 7800: the token names the node's own key, so that a TLS link can be held against it.
-    identity = garden.issue(node.id, node.role, now_s, life_s, cnf={"jwk": {"kty": "OKP", "crv": "Ed25519", "x": x}})
+    public = GardenKey.load(key_path).public()
+    # The token names the node's own key too, so that a TLS link can be held against it.
+    identity = garden.issue(node.id, node.role, now_s, life_s, cnf=_confirmation(public))
+    _write(folder / "card", garden.card(node.id, node.role, public, now_s, life_s).encode())
     _write(token_path, identity.token.encode())
     return True
 
 
-def _alive(token_path: Path, garden: GardenKey, now_s: float) -> bool:
+def _alive(folder: Path, garden: GardenKey, now_s: float) -> bool:
+    """Whether token and card are there and hold."""
+    verifier = garden.verifier()
     try:
-        garden.verifier().verify(_read(token_path).decode("ascii", "replace").strip(), now_s)
-    except Unauthorised:
+        verifier.verify(_read(folder / "token").decode("ascii", "replace").strip(), now_s)
+        verifier.card(_read(folder / "card").decode("ascii", "replace").strip(), now_s)
+    except (Unauthorised, ConfigError):
         return False
     return True
 

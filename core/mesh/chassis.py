@@ -22,6 +22,7 @@ from core.mesh.describe import describe, docs_page
 from core.mesh.direct import route_of, run_directly
 from core.mesh.events import EventLog
 from core.mesh.guard import Guard, bearer, request_counter
+from core.mesh.peers import Peers
 from core.mesh.problems import problem_response
 from core.mesh.strict import body, no_surplus, parse, plain_read, raw
 from core.wire.documents import Document, HistoryEntry, NodeCard
@@ -37,6 +38,8 @@ class Health(Document):
 
 class Readiness(Document):
     ready: bool = True
+    discovery: list[str] = []
+    """Where this node's peers come from."""
 
 
 def version() -> str:
@@ -106,7 +109,7 @@ def create_app(
         dependencies=[Depends(plain_read)],
     )
     registry = registry if registry is not None else CollectorRegistry()
-    app.state.direct = {}
+    app.state.direct, app.state.peers = {}, None
     app.state.open_reads, app.state.ready_bytes, app.state.requests = open_reads, {}, request_counter(registry)
     app.state.clock, app.state.verifier, app.state.events, app.state.registry = clock, verifier, events, registry
     app.add_middleware(
@@ -196,7 +199,8 @@ def _plain_routes(
     async def readyz() -> Readiness:
         if missing := ready():
             raise Unavailable("; ".join(missing), hint="it is usually a matter of seconds; `garden doctor` looks closer")
-        return Readiness()
+        peers: Peers | None = app.state.peers
+        return Readiness(discovery=[] if peers is None else list(peers.sources))
 
     @app.get("/metrics", summary="Prometheus metrics", tags=["node"], response_class=Response)
     async def metrics() -> Response:

@@ -20,7 +20,7 @@ from core.mesh.problems import problem_response
 
 KEPT_ANSWERS = 256
 KEPT_FOR_S = 600.0
-_OPEN_PATHS = frozenset({"/healthz", "/readyz"})
+_OPEN_PATHS = frozenset({"/healthz", "/readyz", "/introduction"})
 _READS = frozenset({"GET", "HEAD", "OPTIONS"})
 _METHODS = _READS | {"POST", "PUT", "PATCH", "DELETE"}
 BROKEN = GardenError("something broke in here", hint="the log says what")

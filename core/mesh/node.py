@@ -23,6 +23,8 @@ class Node:
     app: FastAPI
     loops: Sequence[Loop] = field(default_factory=tuple)
     """Run for ever beside the server; whatever one raises ends the process. Each makes its devices safe in `finally`."""
+    url: str = ""
+    """Where others reach it; without one it is not announced."""
 
 
 async def serve(

@@ -8,11 +8,13 @@ import sys
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from random import Random
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
 import structlog
-from pydantic import Field
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import Field, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from core.clock import Clock, WallClock, WorldClock
 from core.errors import ConfigError, GardenError
@@ -35,12 +37,23 @@ class GardenSettings(BaseSettings):
     keys: Path | None = None
     """This node's own key folder; without one the node has no identity and accepts no change."""
     peers: list[Peer] = []
+    discovery: Annotated[tuple[Literal["mdns", "routes"], ...], NoDecode] = ()
+    """How peers are found beside that list, separated by commas."""
+    discovery_port: Annotated[int, Field(ge=1, le=65535)] = 8100
+    """Where the service of every host listens that a routing table names."""
+    hops_max: Annotated[int, Field(ge=1, le=255)] = 255
+    """Robots and plants farther away are not asked."""
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 0
     log: Literal["auto", "json", "text"] = "auto"
     open_reads: bool = True
     """Reading needs no token. Right only while the port is published on loopback."""
     seed: int = 0
+
+    @field_validator("discovery", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +91,9 @@ def make_runtime(settings: GardenSettings | None = None) -> Runtime:
     if settings.keys is None:
         raise ConfigError("GARDEN_KEYS names no key folder", hint="run `garden init`, then set GARDEN_KEYS=DATA/keys/NODE")
     identity, verifier = Identity.load(settings.keys), Verifier.load(settings.keys)
-    return Runtime(settings, clock, clock_loops, identity, verifier, Peers(settings.peers), HttpTransport())
+    return Runtime(
+        settings, clock, clock_loops, identity, verifier, Peers(settings.peers, settings.hops_max), HttpTransport()
+    )
 
 
 def setup_logging(how: str = "auto") -> None:
@@ -136,11 +151,33 @@ async def _run(build: Builder, settings: GardenSettings) -> None:
             await _first_time(runtime.clock)
             node = await build(runtime)
             structlog.contextvars.bind_contextvars(node=node.id)
-            await serve(node, settings.host, settings.port)
+            await serve(node, settings.host, settings.port, finding(runtime, node))
             for task in clocks:
                 task.cancel()
     finally:
         await runtime.transport.aclose()
+
+
+def finding(runtime: Runtime, node: Node) -> Sequence[Loop]:
+    """The loops that find this node's peers, besides the static list; raises ConfigError."""
+    from core.mesh.discovery import Discovery, Source
+    from core.mesh.mdns import MulticastDns
+    from core.mesh.routes import KernelRoutes
+
+    settings = runtime.settings
+    if not settings.discovery:
+        return ()
+    if not node.url:
+        raise ConfigError(f"{node.id} does not know its own URL, so nobody can find it", hint="set PLANT_URL or ROBOT_URL")
+    made: dict[str, Source] = {
+        "mdns": MulticastDns(node.id, node.kind, node.url),
+        "routes": KernelRoutes(runtime.clock, settings.discovery_port),
+    }
+    discovery = Discovery(
+        node.id, runtime.peers, runtime.transport, runtime.verifier, runtime.clock, Random(f"{settings.seed}:{node.id}"),
+        [made[name] for name in settings.discovery], loopback=urlsplit(node.url).hostname in ("127.0.0.1", "::1"),
+    )  # fmt: skip
+    return discovery.loops()
 
 
 async def _endless(loop: Loop) -> None:

@@ -67,7 +67,8 @@ class Operation:
         filled = filled.replace("{when}", "before")
         for name in ("task_id", "fruit_id", "line_id", "order_id", "job_id", "fault_id", "reservation_id"):
             filled = filled.replace(f"{{{name}}}", ids.get(name, "nobody:1:1"))
-        return filled + ("?w=32&h=24" if filled.endswith("hand.jpg") else "")
+        asked = {"/introduction": "?nonce=0123456789abcdef"}
+        return filled + ("?w=32&h=24" if filled.endswith("hand.jpg") else asked.get(filled, ""))
 
 
 @dataclass

@@ -88,7 +88,8 @@ def test_a_known_token_is_not_checked_twice(monkeypatch: pytest.MonkeyPatch) -> 
 def test_init_makes_each_node_a_folder_of_its_own(tmp_path: Path) -> None:
     made = make_garden(tmp_path, [Enrolled("plant-1", "plant"), Enrolled("robot-1", "robot", secret=True)], 0.0)
     assert made == ["garden.key", "plant-1", "robot-1", "operator", "viewer"]
-    assert sorted(p.name for p in (tmp_path / "robot-1").iterdir()) == ["body.secret", "garden.pub", "node.key", "token"]
+    mine = sorted(p.name for p in (tmp_path / "robot-1").iterdir())
+    assert mine == ["body.secret", "card", "garden.pub", "node.key", "token"]
     for private in ("garden.key", "plant-1/node.key", "plant-1/token", "robot-1/body.secret"):
         assert stat.S_IMODE((tmp_path / private).stat().st_mode) == 0o600
     identity = Identity.load(tmp_path / "plant-1")

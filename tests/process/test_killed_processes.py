@@ -14,6 +14,8 @@ from lab import story
 from sim.clockwork import TICK_S
 from sim.keeping import EVERY_S
 
+pytestmark = pytest.mark.alone
+
 FAST = 6.0
 SLOW = 0.25
 """Looking over HTTP takes little garden time at this speed."""

@@ -356,6 +356,7 @@ def test_no_secret_no_body(tmp_path: Path) -> None:
     run_virtual(main())
 
 
+@pytest.mark.alone
 def test_the_control_loop_costs_at_most_8_ms_of_cpu_per_garden_second(tmp_path: Path) -> None:
     import time
 

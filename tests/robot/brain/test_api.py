@@ -92,6 +92,7 @@ def test_state_position_and_history_are_open_and_whole():
     asked(story)
 
 
+@pytest.mark.alone
 def test_bids_come_within_a_few_milliseconds_of_work():
     import time
 
