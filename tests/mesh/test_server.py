@@ -23,6 +23,8 @@ from core.mesh.peers import Peer
 from core.mesh.server import listen
 from core.wire.documents import NodeCard, Problem
 
+pytestmark = pytest.mark.alone
+
 Story = Callable[[int], Awaitable[None]]
 
 
