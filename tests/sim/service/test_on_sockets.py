@@ -51,6 +51,7 @@ async def visit(address: str) -> None:
         following.cancel()
 
 
+@pytest.mark.alone
 def test_the_world_serves_bytes_time_and_truth_and_ends_cleanly_on_sigterm(tmp_path: Path) -> None:
     async def main() -> None:
         clock = WallClock()
