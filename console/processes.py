@@ -91,10 +91,10 @@ def peers_of(scenario: Scenario, host: Callable[[str], str]) -> list[Peer]:
 
 
 def processes(scenario: Scenario, place: Place, world: World | None = None) -> list[Process]:
-    """The whole garden, the world first."""
+    """The whole garden, the world first; without the pots that others start."""
     maker = _Maker(scenario, place)
     listed = [maker.sim(world or World())]
-    listed += [maker.plant(plant) for plant in scenario.plants]
+    listed += [maker.plant(plant) for plant in scenario.plants if not plant.external]
     listed.append(maker.station())
     for robot in scenario.robots:
         listed += [maker.body(robot), maker.brain(robot)]

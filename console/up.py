@@ -138,7 +138,8 @@ async def _up(wish: Wish, scenario: Scenario, listed: Sequence[Process]) -> None
 async def _greet(wish: Wish, scenario: Scenario, runner: Runner, voice: Voice) -> None:
     """Wait until everybody answers, say so, then tell what the pots tell."""
     mesh = Mesh(HttpTransport(), None, WallClock(), timeout_s=5.0)
-    peers = {peer.id: peer for peer in wish.folder.peers_written()}
+    ours = {process.name for process in runner.processes}
+    peers = {peer.id: peer for peer in wish.folder.peers_written() if peer.id in ours}
     began_s = asyncio.get_running_loop().time()
     try:
         async with asyncio.timeout(READY_WITHIN_S), asyncio.TaskGroup() as group:
@@ -178,15 +179,16 @@ async def _tell_late(peers: Iterable[str], runner: Runner, voice: Voice) -> None
 
 
 def _say_ready(wish: Wish, scenario: Scenario, peers: dict[str, Peer], voice: Voice, seconds: float) -> None:
-    plant, robot = scenario.plants[0].id, scenario.robots[0].id
+    plant = next((peer for peer in peers.values() if peer.kind == "plant"), peers[scenario.station.id])
+    robot = scenario.robots[0].id
     data = "" if wish.folder.root == Path("data") else f" --data {wish.folder.root}"
     lines = [
         f"Garden ready after {seconds:.1f} s. Ctrl-C ends it.",
         f"  the garden in a browser:  {peers['console'].url}",
         f"  the world from above:     {peers['sim'].url}/overview.jpg",
-        f"  curl -s {peers[plant].url}/state",
+        f"  curl -s {plant.url}/state",
         f"  curl -s {peers[robot].url}/state",
-        f'  curl -s -X POST {peers[plant].url}/tasks -H "Authorization: Bearer $(.venv/bin/garden token{data})"'
+        f'  curl -s -X POST {plant.url}/tasks -H "Authorization: Bearer $(.venv/bin/garden token{data})"'
         ' -d \'{"kind": "water", "dose_ml": 100}\'',
     ]
     urls = {peer.id: peer.url for peer in peers.values()}

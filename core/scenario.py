@@ -67,6 +67,8 @@ class Plant(_Section):
     """Whether the pot asks for scans of its fruit by itself."""
     harvest: bool = True
     """Whether it asks for ripe fruit to be picked by itself."""
+    external: bool = False
+    """Its service is started by somebody else; it has its port, its keys and its probe all the same."""
 
     @property
     def dock(self) -> Pose2:

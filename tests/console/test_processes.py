@@ -14,7 +14,7 @@ from console.folder import Folder
 from console.processes import World, enrolled, ports_of, processes
 from core import scenario as scenarios
 from core.mesh.peers import Peer
-from core.scenario import Scenario
+from core.scenario import Scenario, device_ports
 from plant_service.settings import PlantSettings
 from robot_service.body.settings import BodySettings
 from robot_service.settings import RobotSettings
@@ -30,6 +30,16 @@ def test_the_default_garden_is_eleven_processes_world_first() -> None:
     bodies = ["robot-1-body", "robot-2-body"]
     assert sorted(names) == sorted([*ports_of(GARDEN), *bodies])
     assert len(names) == 11
+
+
+def test_an_external_pot_is_a_peer_with_port_keys_and_probe_but_no_process_of_ours() -> None:
+    *ours, last = GARDEN.plants
+    garden = GARDEN.model_copy(update={"plants": (*ours, last.model_copy(update={"external": True}))})
+    listed = processes(garden, Folder(Path("data")).place())
+    assert last.id not in {process.name for process in listed}
+    assert last.id in {node.id for node in enrolled(garden)}
+    assert last.id in {peer["id"] for process in listed for peer in json.loads(process.env["GARDEN_PEERS"])}
+    assert device_ports(garden)[f"{last.id}.soil"] in listed[0].devices
 
 
 SETTINGS = {
