@@ -10,8 +10,8 @@ import sys
 import time
 from pathlib import Path
 
-KILLS = 200
-WRITERS = 4
+import pytest
+
 WRITER = """
 import os, sys
 from pathlib import Path
@@ -27,21 +27,22 @@ while True:
 """
 
 
-def test_two_hundred_kills_lose_nothing_that_was_acknowledged(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kills", [500, pytest.param(10_000, marks=pytest.mark.soak)])
+def test_kills_lose_nothing_that_was_acknowledged(kills: int, tmp_path: Path) -> None:
     seed = 11
     print("seed", seed)
     rng = random.Random(seed)
     acknowledged = 0
     forker = _Forker(tmp_path / "doc.json")
     try:
-        for kill in range(KILLS):
+        for kill in range(kills):
             first, last = forker.life(rng.uniform(0.002, 0.04))
             assert first >= acknowledged, f"kill {kill}: {acknowledged} was acknowledged, {first} was found"
             assert first <= acknowledged + 1
             acknowledged = max(first, last)
     finally:
         forker.close()
-    assert acknowledged > KILLS
+    assert acknowledged > kills
     assert not list(tmp_path.glob("*.bad-*"))
 
 

@@ -119,7 +119,7 @@ def test_any_damaged_byte_is_noticed_and_the_older_copy_used(tmp_path: Path) -> 
     print("seed", seed)
     rng = random.Random(seed)
     good, older = pack("test/1", 2, b'{"n":2}'), pack("test/1", 1, b'{"n":1}')
-    for round_ in range(1000):
+    for round_ in range(5000):
         folder = tmp_path / str(round_ % 7)
         folder.mkdir(exist_ok=True)
         damaged = _damage(good, rng)

@@ -286,14 +286,15 @@ def fault(sp: Setpoint, s: GateState, now_s: float, c: Command, debit_ml: float)
     return "debit against the caps" if debit_ml > 0 and (s.dose.refusal or debit_ml != sp.dose_ml) else ""
 
 
-def test_100000_random_steps_stay_within_the_rules() -> None:
+@pytest.mark.parametrize("steps", [100_000, pytest.param(1_000_000, marks=pytest.mark.soak)])
+def test_random_steps_stay_within_the_rules(steps: int) -> None:
     seed = 20261122
     print("seed", seed)
     rng = random.Random(seed)
     setpoints = [draw_setpoint(rng) for _ in range(3000)]
     states = [draw_state(rng, NOW_S) for _ in range(3000)]
     before, alive, wet = STOP, 0, 0
-    for step in range(100_000):
+    for step in range(steps):
         setpoint = setpoints[int(rng.random() * 3000)]
         state = replace(states[int(rng.random() * 3000)], v_mps=before.v_mps, omega_radps=before.omega_radps)
         verdict = check(setpoint, state, NOW_S)
@@ -302,8 +303,8 @@ def test_100000_random_steps_stay_within_the_rules() -> None:
         before = verdict.command
         alive += verdict.command.base == "drive"
         wet += verdict.command.pump
-    assert alive > 5_000
-    assert wet > 300
+    assert alive > steps / 20
+    assert wet > 0.003 * steps
 
 
 # Who may touch a device
