@@ -17,15 +17,17 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 
 from console import tables
+from console.diagram import text, write
 from console.folder import Folder
 from console.orders import order_of, place
 from console.snapshot import all_tasks, look
+from console.story import Story, tell
 from core.clock import Clock, WallClock
 from core.errors import BadRequest, GardenError, NotFound, PeerDown
 from core.mesh.client import Mesh
 from core.mesh.http import HttpTransport
 from core.mesh.peers import Peer, PeerKind, Peers
-from core.wire.documents import Document
+from core.wire.documents import Document, HistoryEntry
 from core.wire.market import Task, TaskRequest
 from core.wire.order import Order, OrderRequest
 from core.wire.plant import PlantState
@@ -131,10 +133,19 @@ async def _watch(line: Line) -> None:
             await asyncio.sleep(WATCH_S)
 
 
-def tasks(task_id: str, data: Path, as_json: bool) -> None:
+def tasks(task_id: str, diagram: bool, out: Path | None, data: Path, as_json: bool) -> None:
+    if not task_id and (diagram or out is not None):
+        raise BadRequest("a diagram is of one task", hint="`garden tasks` lists them; then `garden tasks ID --diagram`")
     if task_id:
-        task = _run(data, "", lambda line: _find_task(line, task_id))
-        _show(task, as_json, lambda: tables.story(task))
+        story = _run(data, "", lambda line: _story(line, task_id))
+        if out is not None:
+            write(story, out)
+        if as_json:
+            print(json.dumps(story.task.model_dump(mode="json") | {"story": _plain(story.steps)}, indent=1))
+        elif diagram:
+            print(text(story), end="")
+        elif out is None:
+            Console().print(tables.story(story))
         return
     listed = _run(data, "", _all_tasks)
     _show(listed, as_json, lambda: tables.tasks(listed))
@@ -155,6 +166,18 @@ async def _find_task(line: Line, task_id: str) -> Task:
     if down and len(down) == len(answers):
         raise down[0]
     raise NotFound(f"no pot knows a task {task_id!r}", hint="`garden tasks` lists them")
+
+
+async def _story(line: Line, task_id: str) -> Story:
+    """The task and what everybody who knows of it remembers; who does not answer is left out."""
+    task = await _find_task(line, task_id)
+    robots = line.peers.of_kind("robot")
+    told = await line.mesh.ask_all(robots, "GET", "/history", expect=list[HistoryEntry])
+    plants = [peer for peer in line.peers.of_kind("plant") if peer.id == task.plant_id]
+    noted = await line.mesh.ask_all(plants, "GET", f"/history?task_id={task_id}&limit=5000", expect=list[HistoryEntry])
+    own = noted.get(task.plant_id, [])
+    heard = {name: answer for name, answer in told.items() if not isinstance(answer, GardenError)}
+    return tell(task, [] if isinstance(own, GardenError) else own, heard)
 
 
 def water(plant: str, ml: float | None, data: Path, as_json: bool) -> None:

@@ -144,13 +144,15 @@ def robots(data: Data = DATA, as_json: Json = False) -> None:
 @app.command()
 def tasks(
     task_id: Annotated[str, typer.Argument(help="Tell this task's story: who bid what, who won, why")] = "",
+    diagram: Annotated[bool, typer.Option("--diagram", help="As a message sequence, time downwards")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Draw it to a file: .svg, .mmd (Mermaid) or .txt")] = None,
     data: Data = DATA,
     as_json: Json = False,
 ) -> None:
-    """All tasks, or one task's story."""
+    """All tasks, or one task's story from the pot's and the robots' own histories."""
     from console import ask
 
-    ask.tasks(task_id, data, as_json)
+    ask.tasks(task_id, diagram, out, data, as_json)
 
 
 @app.command()

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from console.snapshot import Silent, Snapshot
+from console.story import Story
 from core.wire.market import FINAL_STATES, Bid, BidRound, Task
 from core.wire.order import Order
 from core.wire.plant import PlantState, StationState
@@ -91,8 +92,9 @@ def silent(listed: Sequence[Silent]) -> Table:
     return table
 
 
-def story(task: Task) -> RenderableType:
+def story(told: Story) -> RenderableType:
     """One task from its first announcement to its end: who bid what, who won, and why."""
+    task = told.task
     head = Text(f"{task.task_id}: {task.kind} for {task.plant_id}, {task.state}", style="bold")
     lines = [f"asked by {task.asked_by or '?'} at {task.created_s:.1f} s: {task.why}"]
     if task.kind == "water":
@@ -107,10 +109,10 @@ def story(task: Task) -> RenderableType:
         lines.append(f"reason: {task.reason}")
     parts: list[RenderableType] = [head, *lines]
     parts += [auction(round_) for round_ in task.rounds]
-    events = _table("Events", "at s", "what", "robot", "epoch")
-    for event in task.events:
-        events.add_row(f"{event.t_s:.1f}", event.what, event.robot_id, str(event.epoch))
-    return Group(*parts, events)
+    steps = _table("What happened", "at s", "who", "what")
+    for step in told.steps:
+        steps.add_row(f"{step.t_s:.1f}", step.who, step.what)
+    return Group(*parts, steps)
 
 
 def progress(order: Order) -> str:

@@ -185,6 +185,15 @@ def test_a_tasks_story_tells_who_bid_what_who_won_and_why(street: Street, tmp_pa
     assert "garden tasks" in refused(tmp_path, "tasks", "plant-9:9:9").hint
 
 
+def test_a_tasks_story_can_be_drawn_and_read_by_programs(street: Street, tmp_path: Path) -> None:
+    drawn = garden(tmp_path, "tasks", "plant-1:1:1", "--diagram").stdout
+    assert all(word in drawn for word in ("robot-1", "plant-1", "robot-2", "->|"))
+    assert asked(tmp_path, "tasks", "plant-1:1:1")["story"][0].keys() == {"t_s", "source", "target", "what"}
+    garden(tmp_path, "tasks", "plant-1:1:1", "--out", str(tmp_path / "story.svg"))
+    assert (tmp_path / "story.svg").read_text().startswith("<svg")
+    assert "ID --diagram" in refused(tmp_path, "tasks", "--diagram").hint
+
+
 def test_status_tells_who_is_silent(street: Street, tmp_path: Path) -> None:
     told = asked(tmp_path, "status")
     assert (len(told["plants"]), len(told["robots"])) == (4, 2)
