@@ -89,6 +89,18 @@ def up(
 
 
 @app.command()
+def demo(
+    speed: Annotated[float | None, typer.Option(min=0.1, max=20, help="Garden seconds a second (default 3)")] = None,
+    data: Annotated[Path | None, typer.Option("--data", help="Keep logs and documents here")] = None,
+    as_json: Json = False,
+) -> None:
+    """Two minutes: the winning robot is killed on its way, and the task goes to the other."""
+    from console.demo import demo as play
+
+    play(speed, data, as_json)
+
+
+@app.command()
 def init(
     scenario: Annotated[str, typer.Option(help="Whose nodes to enrol")] = "garden",
     data: Data = DATA,
@@ -271,6 +283,14 @@ def compose(
     from console.compose import compose as write
 
     write(scenario, as_json)
+
+
+@app.command()
+def manifests(scenario: Annotated[str, typer.Option(help="A built-in scenario's name")] = "garden") -> None:
+    """Print the Kubernetes objects of a scenario."""
+    from console.kubernetes import manifests as written
+
+    print(written(scenario), end="")
 
 
 @app.command()
