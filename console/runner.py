@@ -39,6 +39,11 @@ class Child:
     ready: bool = False
     deaths: int = 0
     born_s: float = 0.0
+    wanted: asyncio.Event = field(default_factory=asyncio.Event)
+    """Cleared while it is to stay down."""
+
+    def __post_init__(self) -> None:
+        self.wanted.set()
 
 
 @dataclass(slots=True)
@@ -61,6 +66,21 @@ class Runner:
         finally:
             await asyncio.shield(self._end())
 
+    def kill(self, name: str) -> int:
+        """SIGKILL one process, and keep it down until `start`; the pid it had. Raises ConfigError when it does not run."""
+        child = self.children[name]
+        if child.running is None or child.running.returncode is not None:
+            raise ConfigError(f"{name} does not run", hint=f"see {child.log}")
+        child.wanted.clear()
+        child.ready = False
+        child.running.kill()
+        return child.running.pid
+
+    def start(self, name: str) -> None:
+        """Let a process that was killed live again."""
+        self.children[name].deaths = 0
+        self.children[name].wanted.set()
+
     async def _keep(self, child: Child) -> None:
         """Start, wait for the end, wait a little longer each time, start again."""
         delay_s = BACKOFF_S[0] / 2
@@ -71,8 +91,10 @@ class Runner:
                 raise ConfigError(f"{child.process.name} does not start:\n{tail(child.log)}", hint=f"all of it: {child.log}")
             lived_s = asyncio.get_running_loop().time() - child.born_s
             delay_s = BACKOFF_S[0] if lived_s > STEADY_S else min(delay_s * 2, BACKOFF_S[1])
-            self.tell(child.process.name, f"ended ({ending(code)}), starting again in {delay_s:.1f} s")
-            await asyncio.sleep(delay_s)
+            if child.wanted.is_set():
+                self.tell(child.process.name, f"ended ({ending(code)}), starting again in {delay_s:.1f} s")
+                await asyncio.sleep(delay_s)
+            await child.wanted.wait()
 
     async def _live(self, child: Child) -> int:
         child.born_s = asyncio.get_running_loop().time()

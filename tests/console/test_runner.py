@@ -125,3 +125,24 @@ def test_settings_meant_for_others_do_not_leak_in(monkeypatch: pytest.MonkeyPatc
     environment = runner_module.environment(sleeper(tmp_path))
     assert "PLANT_DOSE_ML" not in environment
     assert environment["HOME"] == "/home/x"
+
+
+def test_what_is_killed_on_purpose_stays_down_until_it_is_started(tmp_path: Path) -> None:
+    told: list[str] = []
+    runner = Runner([sleeper(tmp_path)], tmp_path / "logs", lambda name, what: told.append(what))
+
+    async def story() -> None:
+        await until(lambda: len(pids(tmp_path)) == 1)
+        runner.children["sleeper"].ready = True
+        assert runner.kill("sleeper") == pids(tmp_path)[0]
+        await until(lambda: not alive(pids(tmp_path)[0]))
+        await asyncio.sleep(2 * runner_module.BACKOFF_S[0])
+        assert len(pids(tmp_path)) == 1
+        with pytest.raises(ConfigError, match="does not run"):
+            runner.kill("sleeper")
+        runner.start("sleeper")
+        await until(lambda: len(pids(tmp_path)) == 2)
+
+    asyncio.run(running(runner, story))
+    assert told == []
+    assert not alive(pids(tmp_path)[1])
