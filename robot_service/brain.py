@@ -7,7 +7,7 @@ import random
 
 import httpx
 
-from core.allocation.bidding import Condition, Stop, price, work_s
+from core.allocation.bidding import OTHER_WORK_S, Condition, Stop, price, work_s
 from core.allocation.epochs import owner_of
 from core.allocation.queue import Entry, TaskQueue
 from core.clock import Clock
@@ -204,33 +204,27 @@ class Brain:
             battery_ratio=0.0 if body is None else body.battery_ratio,
             tank_ml=None if body is None else body.tank_ml,
             docked_at=where.docked_at,
-            current_s=self._rest_s(running),
             current=None if running is None else self._stop(running),
+            at_work_s=0.0 if running is None else self._at_work_s(running),
             queue=tuple(self._stop(entry) for entry in self.queue.entries if not entry.running),
             taps=tuple(dock.name for dock in docks if dock.tap),
             chargers=tuple(dock.name for dock in docks),
         )
 
     def _stop(self, entry: Entry) -> Stop:
-        dose_ml = entry.announcement.dose_ml if entry.announcement is not None else 0.0
-        own = entry.announcement is None
-        dock = self.robot.where.docked_at if own else entry.plant_id
-        return Stop(
-            dock=dock,
-            work_s=30.0 if own else work_s(entry.kind, dose_ml),  # type: ignore[arg-type]
-            dose_ml=dose_ml,
-            task_id=entry.task_id,
-            charge=entry.kind == "charge",
-            refill=entry.kind == "refill",
-        )
+        if (asked := entry.announcement) is not None:
+            labour_s = work_s(asked.kind, asked.dose_ml, asked.count)
+            return Stop(dock=entry.plant_id, work_s=labour_s, dose_ml=asked.dose_ml, task_id=entry.task_id)
+        charge, refill = entry.kind == "charge", entry.kind == "refill"
+        dock = "" if charge or refill else self.robot.where.docked_at
+        return Stop(dock=dock, work_s=OTHER_WORK_S, task_id=entry.task_id, charge=charge, refill=refill)
 
-    def _rest_s(self, running: Entry | None) -> float:
-        """Seconds the running task still needs: its usual length less what is spent of it."""
-        if running is None:
-            return 0.0
-        spent_s = self.clock.now() - self.scheduler.began_s
-        whole_s = 60.0 + (running.announcement.dose_ml / gardener.PUMP_MLPS if running.announcement is not None else 60.0)
-        return max(5.0, whole_s - spent_s)
+    def _at_work_s(self, running: Entry) -> float:
+        """How long it has been at what it came for."""
+        where, now_s = self.robot.where, self.clock.now()
+        if running.announcement is None:
+            return now_s - self.scheduler.began_s
+        return now_s - max(self.scheduler.began_s, where.docked_s) if where.docked_at == running.plant_id else 0.0
 
     def award(self, award: Award, caller: Caller) -> QueuedTask:
         """Take a task; raises Forbidden for another plant's, Refused for a stale epoch."""

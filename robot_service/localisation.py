@@ -35,6 +35,8 @@ class Localisation:
         self._moved_blind_s = 0.0
         self.docked_at = ""
         """The dock whose charge current flows into us; empty when undocked."""
+        self.docked_s = 0.0
+        """Since when [garden s]."""
         self.fixes = 0
         self.rejected = 0
 
@@ -90,7 +92,7 @@ class Localisation:
             self.docked_at = ""
             return
         if not self.docked_at and (name := self.dock_here()):
-            self.docked_at = name
+            self.docked_at, self.docked_s = name, state.stamp_s
             if self._filter.lost or self.sigma_m > DOCK_SIGMA_M:
                 self._filter.correct(*self._docks[name], state.stamp_s)
 

@@ -31,6 +31,8 @@ SCAN_S = 30.0
 PICK_S = 15.0
 """A fruit from its approach to the basket; the paper took 28 s (8.4)."""
 OTHER_WORK_S = 30.0
+REST_MIN_S = 5.0
+"""What is running needs so much more at least: its last report, or what we misjudged."""
 
 Travel = Callable[[str, str], float | None]
 """Seconds from a place to a dock's launch point; places are dock names or "here". None: no way."""
@@ -38,10 +40,12 @@ Travel = Callable[[str, str], float | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stop:
-    """One thing waiting in the queue: where, how much water, how long the work takes."""
+    """One thing to do: where, how much water, how long the work takes."""
 
     dock: str
-    work_s: float
+    """Empty for the nearest tap or charger."""
+    work_s: float = 0.0
+    """Of `charge` and `refill` nothing: pack and tank say how long they take."""
     dose_ml: float = 0.0
     task_id: str = ""
     charge: bool = False
@@ -62,9 +66,10 @@ class Condition:
     battery_ratio: float = 1.0
     tank_ml: float | None = None
     docked_at: str = ""
-    current_s: float = 0.0
-    """Seconds until the running task is done."""
     current: Stop | None = None
+    """What is running."""
+    at_work_s: float = 0.0
+    """How long it has stood at the dock of what is running."""
     queue: tuple[Stop, ...] = ()
     taps: tuple[str, ...] = ()
     chargers: tuple[str, ...] = ()
@@ -102,6 +107,23 @@ class _Walk:
         known = {dock: time_s for dock, time_s in times.items() if time_s is not None}
         return min(known, key=lambda dock: (known[dock], dock)) if known else None
 
+    def serve(self, stop: Stop, done_s: float = 0.0) -> float | None:
+        """Go there and do it, `done_s` of the work being done already; the seconds it takes, None when there is no way."""
+        me = self.me
+        dock = stop.dock or self.nearest(me.taps if stop.refill else me.chargers if stop.charge else ()) or self.place
+        travel_s = 0.0 if dock == "here" else self.go(dock)
+        if travel_s is None:
+            return None
+        if stop.refill:
+            spent_s, self.tank_ml = refill_s(self.tank_ml), gardener.TANK_ML
+        elif stop.charge:
+            spent_s = charge_s(self.battery_ratio)
+            self.battery_ratio = max(self.battery_ratio, BATTERY_ENOUGH_RATIO)
+        else:
+            spent_s, self.tank_ml = max(0.0, stop.work_s - done_s), self.tank_ml - stop.dose_ml
+            self.use(spent_s, gardener.IDLE_W + gardener.ARM_W)
+        return travel_s + spent_s
+
 
 def work_s(kind: TaskKind, dose_ml: float, count: int = 1) -> float:
     """Seconds of work at the dock: a dose, a scan, or `count` fruit to pick."""
@@ -134,15 +156,13 @@ def price(asked: Announcement, me: Condition) -> Bid:
         walk.place = me.docked_at
     held = me.current is not None and me.current.task_id == asked.task_id
     ahead = _before(asked.task_id, me.queue)
+    cost = Breakdown()
     if me.current is not None:
-        walk.use(me.current_s, gardener.IDLE_W + gardener.DRIVE_W)
-        walk.place, walk.docked = me.current.dock or walk.place, bool(me.current.dock) or walk.docked
-        walk.tank_ml = gardener.TANK_ML if me.current.refill else walk.tank_ml - me.current.dose_ml
-    cost = Breakdown(current_s=me.current_s)
+        cost = Breakdown(current_s=max(REST_MIN_S, walk.serve(me.current, me.at_work_s) or 0.0))
     if held:
         return _yes(asked, me, cost)
     for stop in ahead:
-        if (spent_s := _serve(walk, stop)) is None:
+        if (spent_s := walk.serve(stop)) is None:
             return _no(asked, me, f"no way to {stop.dock}, which is earlier in the queue")
         cost = cost.model_copy(update={"queue_s": cost.queue_s + spent_s})
     return _finish(asked, me, walk, cost)
@@ -173,17 +193,6 @@ def _before(task_id: str, queue: tuple[Stop, ...]) -> tuple[Stop, ...]:
         if stop.task_id == task_id:
             return queue[:index]
     return queue
-
-
-def _serve(walk: _Walk, stop: Stop) -> float | None:
-    travel_s = walk.go(stop.dock)
-    if travel_s is None:
-        return None
-    walk.use(stop.work_s, gardener.IDLE_W + gardener.ARM_W)
-    walk.tank_ml = gardener.TANK_ML if stop.refill else walk.tank_ml - stop.dose_ml
-    if stop.charge:
-        walk.battery_ratio = max(walk.battery_ratio, BATTERY_ENOUGH_RATIO)
-    return travel_s + stop.work_s
 
 
 def _finish(asked: Announcement, me: Condition, walk: _Walk, cost: Breakdown) -> Bid:

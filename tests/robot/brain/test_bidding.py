@@ -4,7 +4,18 @@ from dataclasses import replace
 
 import pytest
 
-from core.allocation.bidding import DOCKING_S, UNDOCKING_S, Condition, Stop, charge_s, price, refill_s, total_s, work_s
+from core.allocation.bidding import (
+    DOCKING_S,
+    REST_MIN_S,
+    UNDOCKING_S,
+    Condition,
+    Stop,
+    charge_s,
+    price,
+    refill_s,
+    total_s,
+    work_s,
+)
 from core.robots import gardener
 from core.wire.geometry import Point3, Pose2
 from core.wire.market import Announcement, PlantCard
@@ -59,11 +70,33 @@ def test_a_docked_robot_has_to_undock_first():
 
 
 def test_the_queue_comes_first_and_moves_where_the_robot_starts_from():
-    busy = replace(ME, current_s=25.0, current=Stop(dock="far", work_s=0.0), queue=(Stop(dock="spare", work_s=7.0),))
+    busy = replace(ME, current=Stop(dock="far", work_s=25.0), queue=(Stop(dock="spare", work_s=7.0),))
     bid = price(asked(), busy)
-    assert bid.breakdown.current_s == 25.0
+    assert bid.breakdown.current_s == pytest.approx(40.0 + DOCKING_S + 25.0)
     assert bid.breakdown.queue_s == pytest.approx(UNDOCKING_S + 10.0 + DOCKING_S + 7.0)
     assert bid.breakdown.travel_s == pytest.approx(UNDOCKING_S + 20.0 + DOCKING_S)
+
+
+def test_of_what_is_running_only_the_rest_is_asked_for():
+    at_it = replace(ME, docked_at="far", current=Stop(dock="far", work_s=25.0, task_id="far:1"))
+    assert price(asked(), replace(at_it, at_work_s=15.0)).breakdown.current_s == pytest.approx(10.0)
+    assert price(asked(), replace(at_it, at_work_s=60.0)).breakdown.current_s == REST_MIN_S
+
+
+@pytest.mark.parametrize("where", ["here", "tap"])
+def test_an_errand_that_began_costs_what_it_was_said_to_cost_on_the_way(where):
+    """A bid that needs a refill first, and the same bid once the robot is on its way to the tap."""
+    thirsty = replace(ME, tank_ml=100.0, docked_at="" if where == "here" else where)
+    before = price(asked(), thirsty)
+    begun = price(asked(), replace(thirsty, current=Stop(dock="", refill=True)))
+    assert before.breakdown.refill_s > 0.0
+    assert begun.breakdown.refill_s == 0.0
+    assert begun.cost_s == pytest.approx(before.cost_s)
+
+
+def test_a_charging_robot_is_free_once_it_has_enough():
+    charging = replace(ME, docked_at="spare", battery_ratio=0.3, current=Stop(dock="", charge=True))
+    assert price(asked(), charging).breakdown.current_s == pytest.approx(charge_s(0.3))
 
 
 def test_a_task_in_the_queue_already_is_priced_where_it_stands():
