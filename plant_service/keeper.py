@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -42,11 +43,23 @@ class Keeper(Generic[M, D]):
         self.durable: D | None = None if stored is None else model.model_validate(stored)
         self._machine = revive(self.durable)
         self._failures = self._saving = 0
+        self.commits, self.commit_s, self.last_commit_s = 0, 0.0, 0.0
+        """How many, how long all of them and the last one took [s of the loop]."""
 
     @property
     def broken(self) -> str:
         """Why nothing is acknowledged any more; empty while all is well."""
         return self._file.broken
+
+    @property
+    def name(self) -> str:
+        """Of its file."""
+        return self._file.path.stem
+
+    @property
+    def failures(self) -> int:
+        """Commits that failed."""
+        return self._file.failures
 
     @property
     def alarms(self) -> list[str]:
@@ -69,10 +82,14 @@ class Keeper(Generic[M, D]):
         machine.dirty = False
         document: D = machine.document()
         self._saving += 1
+        loop = asyncio.get_running_loop()
+        began_s = loop.time()
         try:
             await self._file.save(lambda: self._encode(document))
         finally:
             self._saving -= 1
+            self.last_commit_s = loop.time() - began_s
+            self.commits, self.commit_s = self.commits + 1, self.commit_s + self.last_commit_s
         self.durable = document
 
     async def change(self, event: Callable[[M], T]) -> T:

@@ -20,6 +20,7 @@ from core.wire.documents import Problem
 from core.wire.market import Bid
 from plant_service.journal import Journal
 from plant_service.keeper import Keeper
+from plant_service.tally import Tally
 
 T = TypeVar("T")
 NAP_S_MIN = 0.01
@@ -36,6 +37,7 @@ class Marketplace:
     ) -> None:
         self._keeper, self._mesh, self._peers, self._clock, self._journal = keeper, mesh, peers, clock, journal
         self._wake = asyncio.Event()
+        self.tally = Tally()
         self._log = structlog.get_logger("garden.market")
 
     @property
@@ -90,6 +92,7 @@ class Marketplace:
             return
 
     def _carry_out(self, effect: Effect, group: asyncio.TaskGroup) -> None:
+        self.tally.take(effect)
         match effect:
             case Note():
                 self._journal.note(effect.kind, effect.what, task_id=effect.task_id, robot_id=effect.robot_id, **effect.data)

@@ -13,6 +13,7 @@ from core.clock import Clock
 from core.mesh.auth import Identity, Verifier
 from core.mesh.chassis import create_app
 from core.mesh.client import Mesh, PeerTransport
+from core.mesh.metrics import measure
 from core.mesh.node import Node
 from core.mesh.peers import Peers
 from core.mesh.presence import add_presence, introducer
@@ -27,6 +28,7 @@ from plant_service.journal import Journal
 from plant_service.keeper import Keeper
 from plant_service.ledger import Ledger, LedgerDocument, Lines
 from plant_service.market import Marketplace
+from plant_service.metrics import of_pot, of_station
 from plant_service.pot import Care, Pot
 from plant_service.settings import PlantSettings
 from plant_service.shelf import Shelf
@@ -133,6 +135,7 @@ def build_pot(parts: _Parts) -> Node:
         open_reads=parts.open_reads,
     )  # fmt: skip
     api.add_pot(app, pot)
+    measure(app.state.registry, lambda: of_pot(pot, parts.mesh, keepers, clock.now()))
     app.state.pot = pot
     loops = (probe.run, pot.watch, _closing(place.run, keepers), journal.run)
     return Node(settings.id, "plant", app, loops, settings.url)
@@ -151,6 +154,7 @@ def build_station(parts: _Parts) -> Node:
         open_reads=parts.open_reads,
     )  # fmt: skip
     api.add_station(app, station)
+    measure(app.state.registry, lambda: of_station(station, parts.mesh, keepers))
     loops: list[Loop] = [_closing(journal.run, keepers)]
     if valve is not None:
         loops.append(valve.run)

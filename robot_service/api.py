@@ -12,12 +12,14 @@ from core.errors import Unavailable
 from core.history import as_csv
 from core.mesh.auth import ROLES, Caller, Verifier
 from core.mesh.chassis import allow, body, create_app
+from core.mesh.metrics import measure
 from core.wire.documents import HistoryEntry
 from core.wire.market import Announcement, Award, Bid
 from core.wire.robot import Job, JobRequest, Position, QueuedTask, RobotState, Stopped, StopRequest
 from robot_service.brain import Brain, check_owner, queued
 from robot_service.eye import SHOW_EVERY_S
 from robot_service.failed import SkillFailed
+from robot_service.metrics import RobotReadings
 
 FILM_FRAMES_MAX = 10_000
 Id = Annotated[str, Path(max_length=80)]
@@ -32,6 +34,7 @@ def make_app(brain: Brain, verifier: Verifier | None, open_reads: bool = True) -
         events=brain.events,
         open_reads=open_reads,
     )
+    measure(app.state.registry, RobotReadings(brain).read)
     _market(app, brain)
     _readings(app, brain)
     _camera(app, brain)

@@ -88,6 +88,11 @@ class Reporter:
             state = "cancelled" if entry.killed else report.state
             self.jobs[entry.task_id] = job.model_copy(update={"state": state, "reason": report.reason or entry.killed})
 
+    @property
+    def unheard(self) -> int:
+        """Ends that their plants have not heard yet."""
+        return len(self._finals)
+
     def _telling(self) -> bool:
         """Whether a plant waits for word of us; of the robot's own errands nobody wants to hear."""
         return bool(self._finals) or any(entry.announcement is not None for entry in self.queue.entries)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -101,6 +102,8 @@ class Mesh:
         self._headers = {"authorization": f"Bearer {identity.token}"} if identity else {}
         self._clock = clock
         self._timeout_s = timeout_s
+        self.outcomes: Counter[tuple[str, str]] = Counter()
+        """Requests by peer and how they ended: `answered`, `refused`, `silent`."""
 
     async def call(
         self,
@@ -136,11 +139,15 @@ class Mesh:
         limit_s = self._timeout_s if timeout_s is None else timeout_s
         try:
             async with asyncio.timeout(limit_s):
-                return await self._transport.send(method, peer.url + path, sent, body)
+                answer = await self._transport.send(method, peer.url + path, sent, body)
         except TimeoutError as error:
+            self.outcomes[peer.id, "silent"] += 1
             raise PeerDown(f"{peer.id} did not answer {method} {path} within {limit_s:g} s") from error
         except OSError as error:
+            self.outcomes[peer.id, "silent"] += 1
             raise PeerDown(f"{peer.id} is not reachable at {peer.url}: {error or type(error).__name__}") from error
+        self.outcomes[peer.id, "answered" if answer.status < 400 else "refused"] += 1
+        return answer
 
     async def ask_all(
         self,

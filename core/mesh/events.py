@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
+from collections import Counter, deque
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -19,6 +19,8 @@ class EventLog:
         self._entries: deque[HistoryEntry] = deque(maxlen=size)
         self._next_id = first_id
         self._grown = asyncio.Event()
+        self.counts: Counter[str] = Counter()
+        """Events of this life by kind."""
 
     @property
     def last_id(self) -> int:
@@ -36,6 +38,7 @@ class EventLog:
             data=data,
         )
         self._next_id += 1
+        self.counts[kind] += 1
         self._entries.append(entry)
         self._grown.set()
         self._grown = asyncio.Event()

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from fastapi import FastAPI
 
+from core.mesh.metrics import LoopLag, measure
 from core.mesh.server import listen, make_server, on_signals
 
 Loop = Callable[[], Awaitable[None]]
@@ -34,9 +35,11 @@ async def serve(
     sock = sock or listen(host, port)
     server = make_server(node.app)
     on_signals(server)
+    lag = LoopLag()
+    measure(node.app.state.registry, lag.readings)
     try:
         async with asyncio.TaskGroup() as group:
-            loops = [group.create_task(_run(loop)) for loop in (*clock_loops, *node.loops)]
+            loops = [group.create_task(_run(loop)) for loop in (*clock_loops, *node.loops, lag.run)]
             await server.serve(sockets=[sock])
             for task in loops:
                 task.cancel()
