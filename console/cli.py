@@ -101,6 +101,20 @@ def demo(
 
 
 @app.command()
+def record(
+    file: Annotated[Path, typer.Argument(help="Where to: run.mcap")],
+    for_s: Annotated[float | None, typer.Option("--for", min=0.1, help="Seconds; until Ctrl-C if not given")] = None,
+    camera_s: Annotated[float, typer.Option("--camera-every", min=0, help="Seconds between pictures; 0: none")] = 2.0,
+    data: Data = DATA,
+    as_json: Json = False,
+) -> None:
+    """Record a running garden as MCAP: states, tasks, events, poses, pictures. Foxglove opens it."""
+    from console import record as tape
+
+    tape.record(file, for_s, tape.Every(camera_s=camera_s), data, as_json)
+
+
+@app.command()
 def init(
     scenario: Annotated[str, typer.Option(help="Whose nodes to enrol")] = "garden",
     data: Data = DATA,
