@@ -34,7 +34,7 @@ RADIUS_SIGMA_RATIO = 0.12
 SHIFT_PAIRS_MIN = 4
 """So many fruit tell by how much the whole scan is off."""
 AGAIN = 0.35
-"""Views of one scan see the same leaves and lights: each further one tells this part of what the first told."""
+"""The same leaves and lights are seen again: each further look tells this part of what the first told."""
 THERE_M = 0.03
 """A fruit hangs where it is said to when it is nearer than this; believed no more than its place is known."""
 SEEN_PRIOR, UNSEEN_PRIOR = 0.5, 0.8
@@ -172,9 +172,19 @@ def _cost(sighting: Sighting, fruit: _Expected, distance_m: float) -> float:
 
 
 def _evidence(sighting: Sighting, detector: Accuracy) -> float:
-    """Log-odds that a sighting is of a fruit: the detector's precision and its own word, and more for further views."""
-    once = 0.5 * (logit(detector.precision) + logit(sighting.confidence))
-    return once + AGAIN * max(0, len(sighting.views) - 1) * max(0.0, once)
+    """Log-odds that a sighting is of a fruit: of several views the robot's word, which has weighed them; of a single one
+    the detector's precision and its own word."""
+    if len(sighting.views) > 1:
+        return logit(sighting.confidence)
+    return 0.5 * (logit(detector.precision) + logit(sighting.confidence))
+
+
+def _further(track: Track, seen: Sighting, scan: Scan) -> float:
+    """Log-odds that a sighting of a known fruit adds: seen as before, the same leaves and lights may deceive again."""
+    evidence = _evidence(seen, scan.detector)
+    if len(seen.views) == 1:
+        return max(0.0, evidence)
+    return evidence if _new_eye(track, seen, scan) else AGAIN * evidence
 
 
 def _against(sights: Iterable[float], detector: Accuracy) -> float:
@@ -234,7 +244,7 @@ def _found(track: Track, seen: Sighting, scan: Scan, others: Sequence[Track], no
     }
     # The same view again guesses the same distance: it makes the place no surer.
     sigma_m = math.sqrt(var * (1.0 - trust)) if _from_elsewhere(track, seen, scan) else min(fruit.sigma_m, seen.sigma_m)
-    odds = logit(fruit.confidence) + max(0.0, _evidence(seen, scan.detector))
+    odds = logit(fruit.confidence) + _further(track, seen, scan)
     trust_radius = 1.0 / (1.0 + min(4, fruit.seen_count))
     after = track.with_fruit(
         **moved,
@@ -263,8 +273,10 @@ def _there(sigma_m: float) -> float:
 
 def _from_elsewhere(track: Track, seen: Sighting, scan: Scan) -> bool:
     """Whether a view shows it that did not before, or several do at once."""
-    if len(seen.views) > 1:
-        return True
+    return len(seen.views) > 1 or _new_eye(track, seen, scan)
+
+
+def _new_eye(track: Track, seen: Sighting, scan: Scan) -> bool:
     eyes = [_eye(track.eyes, scan.views[index]) for index in seen.views if index < len(scan.views)]
     return any(eye is None or eye.seen == 0 for eye in eyes)
 
@@ -309,12 +321,13 @@ def _fresh(fruit_id: str, sighting: Sighting, scan: Scan, now_s: float) -> Track
         **sighting.model_dump(exclude={"views", "robot_pose"}), robot_pose=sighting.robot_pose,
     )  # fmt: skip
     track = Track.of(fruit)
-    unseen = [view for index, view in enumerate(scan.views) if index not in sighting.views and in_view(view, track.p)]
-    chance = SEEN_PRIOR / (SEEN_PRIOR + UNSEEN_PRIOR)
-    odds = _evidence(sighting, scan.detector) + _against([chance] * len(unseen), scan.detector)
-    alone = len(sighting.views) == 1
-    if alone and (len(scan.views) > 1 or not in_view(scan.views[sighting.views[0]], track.p)):
-        odds += math.log(LONE_RATIO)
+    odds = _evidence(sighting, scan.detector)
+    if len(sighting.views) == 1:
+        unseen = [view for index, view in enumerate(scan.views) if index not in sighting.views and in_view(view, track.p)]
+        chance = SEEN_PRIOR / (SEEN_PRIOR + UNSEEN_PRIOR)
+        odds += _against([chance] * len(unseen), scan.detector)
+        if len(scan.views) > 1 or not in_view(scan.views[sighting.views[0]], track.p):
+            odds += math.log(LONE_RATIO)
     eyes = _looked(track, scan.views, sighting.views)
     confidence = min(probability(odds), _there(sighting.sigma_m))
     return track.with_fruit(confidence=confidence).model_copy(update={"eyes": eyes})

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from core.errors import Refused
 from core.inventory.sightings import Seen, fuse, upside_down
 from core.inventory.sightings import View as ScanView
+from core.inventory.track import logit, probability
 from core.manipulation.eye import camera_pose, scan_poses
 from core.manipulation.kinematics import Array
 from core.manipulation.swing import swing
@@ -19,11 +21,14 @@ from robot_service.robot import Robot, SkillFailed
 from robot_service.skills.arm import fold_arm, joints_now, move_arm
 from robot_service.skills.plantframe import base_in_plant, mapped, plant_in_base
 
-FUSE_COST_S = 0.02
+FUSE_COST_S, TURN_COST_S = 0.25, 0.10
 RANGE_M_MAX = 0.9
 RANGE_M_MIN = 0.08
 PLANT_RADIUS_M, PLANT_M = 0.27, (0.02, 1.3)
 """The room that a plant takes: round its stem, above its soil."""
+TRUSS_M, FAR_ODDS_PER_M = 0.15, -115.0
+"""Trusses reach so far from the stem; what hangs further out is a fruit with log-odds less by so much (a fit, as in
+`core.inventory.sightings`)."""
 
 
 async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Scan:
@@ -48,7 +53,7 @@ async def scan(robot: Robot, plant: PlantCard, scan_id: str, task_id: str) -> Sc
     views = [ScanView(T_plant_cam=T_plant_base @ T_base_cam, detections=circles) for T_base_cam, circles in seen]
     await fold_arm(robot)
     camera = robot.eye.camera
-    if await robot.clock.offload(lambda: upside_down(camera, views), 2 * FUSE_COST_S):
+    if await robot.clock.offload(lambda: upside_down(camera, views), TURN_COST_S):
         raise SkillFailed("the pictures agree only when turned: the camera is mounted upside down")
     fruit = await robot.clock.offload(lambda: fuse(camera, views, sure_min=sure_min), FUSE_COST_S)
     return document(robot, plant, scan_id, task_id, views, fruit)
@@ -66,7 +71,7 @@ def document(robot: Robot, plant: PlantCard, scan_id: str, task_id: str, views: 
     """The scan as the plant takes it; the surest fruit if there are more than it takes."""
     camera, pose = robot.eye.camera, base_in_plant(robot.pose(), plant)
     half_x, half_y = math.atan(camera.width / 2 / camera.fx), math.atan(camera.height / 2 / camera.fy)
-    best = sorted(filter(_on_the_plant, seen), key=lambda fruit: -fruit.confidence)[:FRUITS_MAX]
+    best = sorted(map(_weighed, filter(_on_the_plant, seen)), key=lambda fruit: -fruit.confidence)[:FRUITS_MAX]
     return Scan(
         scan_id=scan_id,
         task_id=task_id,
@@ -96,6 +101,12 @@ def _on_the_plant(fruit: Seen) -> bool:
     """What hangs anywhere else is another plant's fruit, or no fruit at all."""
     x_m, y_m, z_m = (float(value) for value in fruit.p)
     return math.hypot(x_m, y_m) < PLANT_RADIUS_M and PLANT_M[0] < z_m < PLANT_M[1]
+
+
+def _weighed(fruit: Seen) -> Seen:
+    """With what its distance from the stem says."""
+    beyond_m = max(0.0, math.hypot(float(fruit.p[0]), float(fruit.p[1])) - TRUSS_M)
+    return replace(fruit, confidence=probability(logit(fruit.confidence) + FAR_ODDS_PER_M * beyond_m))
 
 
 def _view(T_plant_cam: Array, fov_x_rad: float, fov_y_rad: float) -> View:
