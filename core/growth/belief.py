@@ -7,9 +7,12 @@ days the colour takes is one more unknown, shared by all fruit of a plant. Both 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import accumulate
+from operator import mul
 
 from core.growth.stages import (
     COLOURS,
@@ -67,10 +70,10 @@ class Belief:
     def colours(self, now_s: float) -> tuple[float, float, float]:
         """Probabilities of green, turning, red at a time, given that it hangs."""
         days = (now_s - self.at_s) / DAY_S
-        sums = [0.0, 0.0, 0.0]
-        for tau, weight in zip(self.taus, self.weights, strict=True):
-            sums[stage(tau + days, self.turning_days)] += weight
-        return sums[0], sums[1], sums[2]
+        sums = _sums(self.weights)
+        turned = sums[bisect_left(self.taus, -self.turning_days - days)]
+        reddened = sums[bisect_left(self.taus, -days)]
+        return turned, reddened - turned, sums[-1] - reddened
 
     def colour(self, now_s: float) -> Colour:
         likely = self.colours(now_s)
@@ -79,8 +82,9 @@ class Belief:
     def red(self, now_s: float) -> float:
         """Probability that it hangs there, red, given that it hung there when last seen."""
         days = (now_s - self.at_s) / DAY_S
-        dated = zip(self.taus, self.weights, strict=True)
-        return sum(weight * hangs(tau + days) / hangs(tau) for tau, weight in dated if tau + days >= 0.0)
+        red = bisect_left(self.taus, -days)
+        hung: float = sum(map(mul, self.weights[red:], _staying(self.taus[red:], days)))
+        return hung
 
     def tau_days(self, now_s: float) -> float:
         """Mean of the days since it became red; negative: still to go."""
@@ -99,6 +103,18 @@ class Belief:
         """What a fruit of this size when last seen has grown to."""
         was = radius_share(self.tau_days(seen_s), self.turning_days)
         return radius_m * max(1.0, radius_share(self.tau_days(now_s), self.turning_days) / max(was, 0.05))
+
+
+@lru_cache(maxsize=256)
+def _sums(weights: tuple[float, ...]) -> tuple[float, ...]:
+    """Of the first none, one, two .. of them."""
+    return tuple(accumulate(weights, initial=0.0))
+
+
+@lru_cache(maxsize=64)
+def _staying(taus: tuple[float, ...], days: float) -> tuple[float, ...]:
+    """Probability that what hung at each of `taus` hangs `days` later: the same for all that one scan saw."""
+    return tuple(hangs(tau + days) / hangs(tau) for tau in taus)
 
 
 def believe(seen: Sequence[Observation], pace: Pace) -> Belief:
