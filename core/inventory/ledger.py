@@ -10,7 +10,7 @@ Pure Python: a pot runs it. Positions in the plant frame [m], times on the garde
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
@@ -28,6 +28,9 @@ REACH_M = 0.06
 SIGMA_M_MIN = 0.002
 SAG_M_PER_DAY = 0.006
 """Trusses sink and turn: what a day adds to the position's deviation."""
+STIRRED_M, STIRRED_GATE = 0.02, 9.0
+"""A truss that lost a fruit to a hand, or was pushed, hangs elsewhere: deviation of the place of what is missing while the
+like of it has come up nearby; it has to be more alike than in the same place."""
 BIAS_SIGMA_M = 0.006
 """A docked robot's own pose moves a whole scan by about this much."""
 RADIUS_SIGMA_RATIO = 0.12
@@ -91,10 +94,13 @@ def merge(
     `undecided` are fruit in doubt whose pick may still be under way: this scan does not settle them.
     """
     pairs = associate(tracks, scan.sightings, pace, now_s)
-    seen_by = {column: scan.sightings[row] for row, column in pairs.items()}
+    stirred = _stirred(tracks, scan, pairs, pace, now_s)
+    seen_by = {column: scan.sightings[row] for row, column in [*pairs.items(), *stirred.items()]}
+    pairs |= stirred
     merged = Merged([])
     for i, track in enumerate(tracks):
-        after = _found(track, seen_by[i], scan, tracks, now_s) if i in seen_by else _missed(track, scan, tracks)
+        moved_m = STIRRED_M if i in stirred.values() else 0.0
+        after = _found(track, seen_by[i], scan, moved_m, now_s) if i in seen_by else _missed(track, scan, tracks)
         if track.fruit.fruit_id in undecided:
             merged.tracks.append(after.with_fruit(in_doubt=True))
         else:
@@ -126,6 +132,22 @@ def associate(tracks: Sequence[Track], sightings: Sequence[Sighting], pace: Pace
     return assign(_costs(ready, sightings, (shift[0], shift[1], shift[2])), len(sightings), GATE)
 
 
+def _stirred(tracks: Sequence[Track], scan: Scan, pairs: Mapping[int, int], pace: Pace, now_s: float) -> dict[int, int]:
+    """Of what is left over: which sighting (row) is which fruit (column) that should have been seen where it hung."""
+    known = set(pairs.values())
+    lost = [
+        i for i, t in enumerate(tracks) if i not in known and max(_sights(t, scan, tracks), default=0.0) >= GONE_SIGHT_MIN
+    ]
+    seen_at = [tracks[i] for i in known]
+    come = [
+        row for row, sighting in enumerate(scan.sightings)
+        if row not in pairs and len(sighting.views) > 1 and not _repeats(sighting, seen_at)
+    ]  # fmt: skip
+    ready = [_Expected.of(tracks[i], pace, now_s, STIRRED_M) for i in lost]
+    found = assign(_costs(ready, [scan.sightings[row] for row in come], (0.0, 0.0, 0.0)), len(come), STIRRED_GATE)
+    return {come[row]: lost[column] for row, column in found.items()}
+
+
 @dataclass(frozen=True, slots=True)
 class _Expected:
     """A known fruit as it should look now."""
@@ -136,10 +158,10 @@ class _Expected:
     colours: tuple[float, float, float]
 
     @classmethod
-    def of(cls, track: Track, pace: Pace, now_s: float) -> _Expected:
+    def of(cls, track: Track, pace: Pace, now_s: float, moved_m: float = 0.0) -> _Expected:
         fruit, belief = track.fruit, track.belief(pace)
         radius_m = belief.radius_m(fruit.radius_m, fruit.last_seen_s, now_s)
-        return cls(track.p, _aged_var(fruit, now_s) + BIAS_SIGMA_M**2, radius_m, belief.colours(now_s))
+        return cls(track.p, _aged_var(fruit, now_s) + moved_m**2 + BIAS_SIGMA_M**2, radius_m, belief.colours(now_s))
 
 
 def _aged_var(fruit: Fruit, now_s: float) -> float:
@@ -235,9 +257,9 @@ def _looked(track: Track, views: Sequence[View], seen_in: Sequence[int]) -> list
 # One fruit
 
 
-def _found(track: Track, seen: Sighting, scan: Scan, others: Sequence[Track], now_s: float) -> Track:
+def _found(track: Track, seen: Sighting, scan: Scan, moved_m: float, now_s: float) -> Track:
     fruit = track.fruit
-    var, new_var = _aged_var(fruit, now_s), max(seen.sigma_m, SIGMA_M_MIN) ** 2 + BIAS_SIGMA_M**2
+    var, new_var = _aged_var(fruit, now_s) + moved_m**2, max(seen.sigma_m, SIGMA_M_MIN) ** 2 + BIAS_SIGMA_M**2
     trust = var / (var + new_var)
     moved = {
         axis: getattr(fruit, axis) + trust * (getattr(seen, axis) - getattr(fruit, axis)) for axis in ("x_m", "y_m", "z_m")

@@ -193,6 +193,35 @@ def test_a_green_fruit_that_turns_and_reddens_is_the_same_one() -> None:
     assert [key for key, _ in itertools.groupby(said)] == ["green", "turning", "red"]
 
 
+def test_a_fruit_whose_truss_was_pushed_aside_is_the_same_one_elsewhere() -> None:
+    rng = random.Random(12)
+    plant = Plant(truss(12, rng), rng)
+    for _ in range(3):
+        plant.scan()
+        plant.now_s += 3600.0
+    pushed = plant.fruit[7]
+    name, hung = plant.of(pushed).fruit.fruit_id, pushed.p
+    pushed.p = (hung[0] + 0.03, hung[1], hung[2] + 0.025)
+    merged = plant.scan()
+    assert (merged.new, merged.left) == ([], [])
+    assert plant.of(pushed).fruit.fruit_id == name
+    assert math.dist(plant.of(pushed).p, pushed.p) < 0.01
+
+
+def test_a_small_new_fruit_is_not_taken_for_a_large_one_that_has_gone() -> None:
+    rng = random.Random(13)
+    plant = Plant(truss(6, rng), rng)
+    for _ in range(3):
+        plant.scan()
+        plant.now_s += 3600.0
+    gone = plant.fruit.pop(3)
+    name = plant.of(gone).fruit.fruit_id
+    plant.fruit.append(Tomato((gone.p[0] + 0.03, gone.p[1], gone.p[2]), "green", 0.005))
+    merged = plant.scan()
+    assert merged.new
+    assert name not in merged.new
+
+
 def test_a_fruit_told_twice_in_one_scan_is_listed_once() -> None:
     rng = random.Random(8)
     plant = Plant([Tomato((0.1, 0.0, 0.2))], rng)
