@@ -79,6 +79,9 @@ def stations(states: Sequence[StationState]) -> Table:
 
 def tasks(listed: Sequence[Task]) -> Table:
     table = _table("Tasks", "task", "kind", "state", "pot", "robot", "phase", "why")
+    for column in table.columns:
+        # An id must be whole to be asked for.
+        column.no_wrap, column.overflow = column.header in ("task", "kind", "state"), "fold"
     for task in listed:
         phase = "" if task.state in FINAL_STATES else task.phase
         table.add_row(task.task_id, task.kind, task.state, task.plant_id, task.robot_id, phase, task.reason or task.why)

@@ -6,10 +6,10 @@ from io import StringIO
 
 from rich.console import Console
 
-from console.tables import plants
+from console.tables import plants, tasks
 from core.wire.fruit import FruitCounts
 from core.wire.geometry import Point3, Pose2
-from core.wire.market import PlantCard
+from core.wire.market import PlantCard, Task
 from core.wire.plant import PlantState, Settings, SoilReading
 
 
@@ -30,4 +30,18 @@ def test_names_and_counts_of_fruit_are_whole_on_eighty_columns() -> None:
     told = out.getvalue()
     print(told)
     assert all(word in told for word in ("plant-1", "plant-2", "green", "turning", "red"))
+    assert max(map(len, told.splitlines())) <= 80
+
+
+def test_a_tasks_id_is_whole_on_eighty_columns() -> None:
+    why = "2 ripe fruit to pick, asked for by an order that came from the console at noon"
+    task = Task(
+        task_id="plant-12:104:1017", kind="inventory", state="announced", plant_id="plant-12", robot_id="robot-1",
+        created_s=0.0, updated_s=0.0, why=why, phase="navigate: waits for dock plant-12",
+    )  # fmt: skip
+    out = StringIO()
+    Console(file=out, width=80).print(tasks([task]))
+    told = out.getvalue()
+    print(told)
+    assert all(word in told for word in ("plant-12:104:1017", "announced"))
     assert max(map(len, told.splitlines())) <= 80
