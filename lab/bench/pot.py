@@ -16,7 +16,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ def bench_pot(n: int = 5) -> list[Row]:
 async def _bench(n: int) -> list[Row]:
     async with AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pot-bench-")))
-        pot = await stack.enter_async_context(_pot(folder))
+        pot = await stack.enter_async_context(running_pot(folder, {}))
         peer = await stack.enter_async_context(_peer(folder))
         rates: dict[str, list[float]] = {}
         p99: dict[str, list[float]] = {}
@@ -112,8 +112,8 @@ async def _body(reader: asyncio.StreamReader, head: bytes) -> None:
 
 
 @asynccontextmanager
-async def _pot(folder: Path) -> Any:
-    """Our pot as a process: where it is, how long until it was ready, what it takes."""
+async def running_pot(folder: Path, more: Mapping[str, str]) -> AsyncIterator[dict[str, Any]]:
+    """Our pot as a process with `more` settings: where it is, how long until it was ready, what it takes."""
     make_garden(folder / "keys", [Enrolled("plant-1", "plant")], time.time())
     board = EmulatorHost(bench_emulator(1), WallClock())
     server = await board.serve_tcp("127.0.0.1", 0)
@@ -121,7 +121,8 @@ async def _pot(folder: Path) -> Any:
     port = _free_port()
     began = time.perf_counter()
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "plant_service", env=_environment(folder, port, server.sockets[0].getsockname()[1]),
+        sys.executable, "-m", "plant_service",
+        env=_environment(folder, port, server.sockets[0].getsockname()[1]) | dict(more),
         stderr=asyncio.subprocess.DEVNULL,
     )  # fmt: skip
     try:
