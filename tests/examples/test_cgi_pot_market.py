@@ -10,6 +10,7 @@ import json
 import random
 import shutil
 import subprocess
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -206,18 +207,24 @@ class Played:
         self.ratio = min(0.3, max(0.1, self.ratio + self.rng.uniform(-0.01, 0.012)))
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_whatever_robots_do_a_pot_holds_to_the_protocol(seed: int) -> None:
-    print(f"seed {seed}")
-    rng = random.Random(seed)
-    played = Played(rng)
-    try:
+SEEDS = range(3)
+
+
+def test_whatever_robots_do_a_pot_holds_to_the_protocol() -> None:
+    counts: Counter[str] = Counter()
+    for seed in SEEDS:
+        print(f"seed {seed}")
+        rng = random.Random(seed)
+        played = Played(rng)
         moves = (played.measure, played.measure, played.report, played.report, played.permit, played.dock, played.pass_time)
-        for _ in range(2500):
-            rng.choice(moves if rng.random() < 0.98 else (played.people,))()
-    finally:
-        played.end()
-    print(played.counts)
-    assert played.counts["permits"] >= 10
-    assert played.counts["refused"] >= 100
-    assert played.counts["cut by the cap"] >= 1
+        try:
+            for _ in range(1700):
+                rng.choice(moves if rng.random() < 0.98 else (played.people,))()
+        finally:
+            played.end()
+        counts.update(played.counts)
+    print(counts)
+    # So much was tried that what is forbidden had its chance.
+    assert counts["permits"] >= 20
+    assert counts["refused"] >= 300
+    assert counts["cut by the cap"] >= 1
