@@ -102,7 +102,7 @@ def ripe_with_room(orchard: Orchard, plant_id: str = PLANT) -> list[FruitTruth]:
     def room_m(one: FruitTruth) -> float:
         others = [Obstacle(centre=in_base(dock, other), radius_m=other.radius_m) for other in fruit if other.id != one.id]
         try:
-            return approaches(in_base(dock, one), one.radius_m, others)[0].room_m
+            return max(way.room_m for way in approaches(in_base(dock, one), one.radius_m, others))
         except Refused:
             return -1.0
 

@@ -73,7 +73,7 @@ def reachable(pose: Pose2, fruit: FruitTruth, others: Sequence[FruitTruth] = ())
         ways = approaches(in_base(pose, fruit), fruit.radius_m, obstacles, ROLLS_RAD)
     except Refused:
         return False
-    return ways[0].room_m >= 0.0
+    return max(way.room_m for way in ways) >= 0.0
 
 
 def visible(world: World, pose: Pose2, hanging: list[FruitTruth]) -> set[str]:

@@ -17,7 +17,8 @@ from robot_service.eye import JPEG_COST_S, Look, drawn_jpeg
 from robot_service.robot import RANK_IDLE, Robot, SkillFailed, reason_of, tuple_of
 from robot_service.skills.dock import dock_at
 from robot_service.skills.drive import drive_to, undock
-from robot_service.skills.pick import KeepPicture, empty_hand, harvest
+from robot_service.skills.hand import empty_hand
+from robot_service.skills.pick import KeepPicture, harvest
 from robot_service.skills.scan import scan
 from robot_service.skills.supply import charge, refill
 from robot_service.skills.water import Poured, water

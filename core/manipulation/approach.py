@@ -23,16 +23,31 @@ BACK_M = 0.20
 """Tool point short of the fruit, as far as the arm can, where the hand may swing aside without touching the plant."""
 READY_M = 0.05
 """Tool point short of the fruit before the last, straight advance."""
+TURNS_M = (READY_M, 0.075, 0.10, LOOK_M)
+"""Short of the fruit level fingers are turned, at the nearest of these with room for it: fingers that stand one above the
+other hide the fruit from the eye, so the hand looks with them level."""
 RETREAT_M = 0.09
 """Straight back with the fruit, until nothing hangs between the fingers and the plant."""
 STEP_M = 0.015
+PULL_TILTS_RAD = (0.30, -0.30, 0.0)
+"""The hand tips up or down while it pulls: the stalk bends over its knuckle and breaks at less force. In order of liking."""
+PULL_LIFTS_RAD = (0.0, 0.35, -0.35, 0.7)
+"""So much steeper than it came the hand goes back with the fruit, where others hang in front of it. In order of liking."""
+PULL_SHARES, TILTED_SHARE = (0.15, 0.3, 0.45, 0.6, 0.8, 1.0), 0.6
+"""Steps of the way back; after `TILTED_SHARE` of it the hand is tipped wholly."""
+ROOM_PULLED_M = 0.002
+"""More room than this is not worth a way back that is liked less."""
 OPENING_SLACK_M = 0.004
 """The fingers open this much wider than the fruit on either side: room for error, none for its neighbour."""
 PITCHES_RAD = tuple(math.radians(d) for d in range(-54, 73, 6))
 ROLLS_RAD = tuple(math.radians(d) for d in (0, 20, -20, 40, -40, 60, -60, 80, -80, 90))
 """For a wrist that rolls."""
+VARIED_RAD = math.radians(24.0)
+"""Ways whose pitches differ by less look past the same leaves."""
 ROOM_M_MIN = -0.004
 """A fruit gives way by so much on its stalk and slides along the finger; with less room the hand stays away."""
+ROOM_SHY_M = 0.0
+"""With less room than this to where the inventory has the others the hand looks from aside first."""
 ROOM_ENOUGH_M = 0.012
 """More room than this to a neighbour is worth nothing."""
 
@@ -55,6 +70,8 @@ HAND_PARTS = (
     Part(front_m=-0.100, half_width_m=0.018, beside_opening=False, low_m=0.030, high_m=0.060),
 )
 """Finger tips, fingers, palm with the hose, camera."""
+HOSE = (Part(front_m=-0.016, half_width_m=0.004, beside_opening=False, low_m=-0.025, high_m=-0.014),)
+"""The nozzle's end below the fingers: it may brush past a fruit, but a way on which it does not is the better one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,6 +94,8 @@ class Approach:
     """Further back on the same line: from there the hand comes in."""
     room_m: float
     """Between the hand and the nearest neighbour; negative when it would be pushed."""
+    hose_room_m: float
+    """The same for the hose."""
 
     @property
     def look(self) -> Joints:
@@ -115,8 +134,15 @@ def way_in(fruit: Point3, pitch_rad: float, from_m: float = LOOK_M, to_m: float 
     return tuple(path)
 
 
-def room_m(fruit: Point3, pitch_rad: float, opening_m: float, others: Sequence[Obstacle], roll_rad: float = 0.0) -> float:
-    """The least distance between the hand, anywhere on its way in, and another fruit's skin [m].
+def room_m(
+    fruit: Point3,
+    pitch_rad: float,
+    opening_m: float,
+    others: Sequence[Obstacle],
+    roll_rad: float = 0.0,
+    parts: Sequence[Part] = HAND_PARTS,
+) -> float:
+    """The least distance between the hand (or some `parts` of it), anywhere on its way in, and another fruit's skin [m].
 
     Roll turns the fingers about the hand's axis; palm and camera stay.
     """
@@ -125,7 +151,7 @@ def room_m(fruit: Point3, pitch_rad: float, opening_m: float, others: Sequence[O
     least = math.inf
     for other in others:
         x, y, z = _in_hand(fruit, bearing, pitch_rad, other.centre)
-        for part in HAND_PARTS:
+        for part in parts:
             across, up = (c * y + s * z, c * z - s * y) if part.beside_opening else (y, z)
             ahead = x - part.front_m
             if ahead > other.radius_m or ahead < -LOOK_M - HAND_M:
@@ -157,12 +183,21 @@ def approaches(
             continue
         roll, room = roomiest(fruit, pitch_rad, opening_m, others, rolls_rad)
         back = _furthest_back(fruit, pitch_rad)
+        hose = room_m(fruit, pitch_rad, opening_m, others, parts=HOSE)
         found.append(
-            Approach(pitch_rad=pitch_rad, opening_m=opening_m, roll_rad=roll, path=path, back=back or path[0], room_m=room)
+            Approach(
+                pitch_rad=pitch_rad,
+                opening_m=opening_m,
+                roll_rad=roll,
+                path=path,
+                back=back or path[0],
+                room_m=room,
+                hose_room_m=hose,
+            )
         )
     if not found:
         raise Refused(f"no way of the hand to the fruit: {why}", hint="another dock or robot may reach it")
-    return sorted(found, key=lambda a: (-min(a.room_m, ROOM_ENOUGH_M), abs(a.pitch_rad)))
+    return sorted(found, key=lambda a: (-min(a.room_m, a.hose_room_m, ROOM_ENOUGH_M), abs(a.pitch_rad)))
 
 
 def roomiest(
@@ -172,6 +207,65 @@ def roomiest(
     rooms = {roll: room_m(fruit, pitch_rad, opening_m, others, roll) for roll in rolls_rad}
     roll = max(rolls_rad, key=lambda turn: (min(rooms[turn], ROOM_ENOUGH_M), -abs(turn)))
     return roll, rooms[roll]
+
+
+def turn_m(fruit: Point3, way: Approach, others: Sequence[Obstacle]) -> float:
+    """How far before the fruit [m] the level fingers can come, and turn there to the way's roll, touching no neighbour."""
+    if not way.roll_rad:
+        return READY_M
+    for short_m in TURNS_M:
+        tool = along(fruit, way.pitch_rad, short_m)
+        if all(
+            room_m(tool, way.pitch_rad, way.opening_m, others, share * way.roll_rad) >= ROOM_M_MIN
+            for share in (0.0, 0.33, 0.67, 1.0)
+        ):
+            return short_m
+    return LOOK_M
+
+
+def way_out(fruit: Point3, way: Approach, radius_m: float, others: Sequence[Obstacle]) -> list[Joints]:
+    """Joints on the way back with a fruit of this radius: straight, or past what it or the hand would drag along.
+
+    Raises Refused when the arm can go none.
+    """
+    best: tuple[float, list[Joints]] | None = None
+    for lift_rad in PULL_LIFTS_RAD:
+        for tilt_rad in PULL_TILTS_RAD:
+            try:
+                path, room = _pulled(fruit, way, radius_m, others, lift_rad, tilt_rad)
+            except Refused:
+                continue
+            if room >= ROOM_PULLED_M:
+                return path
+            if best is None or room > best[0]:
+                best = room, path
+    if best is None:
+        raise Refused("no way back with the fruit", hint="let go")
+    return best[1]
+
+
+def _pulled(
+    fruit: Point3, way: Approach, radius_m: float, others: Sequence[Obstacle], lift_rad: float, tilt_rad: float
+) -> tuple[list[Joints], float]:
+    """One way back, and the room it leaves to the others, the hand's and the fruit's [m]."""
+    path, least = [], math.inf
+    for share in PULL_SHARES:
+        tool = along(fruit, way.pitch_rad - lift_rad, share * RETREAT_M)
+        pitch_rad = way.pitch_rad + tilt_rad * min(1.0, share / TILTED_SHARE)
+        path.append(inverse(tool, pitch_rad))
+        carried = min((math.dist(tool, other.centre) - other.radius_m - radius_m for other in others), default=math.inf)
+        hand = room_m(tool, pitch_rad, 2 * radius_m, others, way.roll_rad)
+        least = min(least, carried, hand, room_m(tool, pitch_rad, 2 * radius_m, others, parts=HOSE))
+    return path, least
+
+
+def varied(ways: Sequence[Approach], count: int) -> list[Approach]:
+    """Up to `count` ways, the best first, each from another side (`VARIED_RAD`) than those before it."""
+    chosen: list[Approach] = []
+    for way in ways:
+        if len(chosen) < count and all(abs(way.pitch_rad - other.pitch_rad) > VARIED_RAD for other in chosen):
+            chosen.append(way)
+    return chosen
 
 
 def _furthest_back(fruit: Point3, pitch_rad: float) -> Joints | None:

@@ -40,6 +40,15 @@ nearly every fruit is in three pictures, from places far enough apart to tell it
 SCAN_STAND_OFF_M = 0.42
 """From the camera to the stem, seen from above: as far back as the arm can fold."""
 
+ASIDE_M = 0.28
+"""From the camera to a fruit that is looked at from aside: fingers and palm stay clear of what hangs about it."""
+ASIDE_OFF_RAD = math.radians(32.0)
+"""So far from the middle of the picture the fruit is then: 40 degrees are its edge."""
+ASIDE_SIGHTS = tuple(
+    (math.radians(up), side) for up, side in ((-15, 1), (-15, -1), (-45, 1), (-45, -1), (10, 1), (10, -1), (-30, 0), (25, 0))
+)
+"""The line of sight's elevation [rad], and whether it comes from the left (1) or the right of the fruit's bearing."""
+
 
 def camera_pose(q: Joints) -> Array:
     """T_base_cam (4, 4) [m] for these joints."""
@@ -81,6 +90,27 @@ def _nearest_pose(stem_base_m: Point3, pan_rad: float, z_m: float, aim_z_m: floa
         first = first or Refused(why, hint="dock again")
     assert first is not None
     raise first
+
+
+def beside(fruit: Point3) -> list[Joints]:
+    """Poses that look at a point of the base frame [m] from aside, above and below; those that the arm can take.
+
+    The arm's camera looks away from its pan axis, so an eye to the side has the fruit at the picture's other side.
+    """
+    away_m, bearing = math.hypot(fruit[0] - SHOULDER_X_M, fruit[1]), math.atan2(fruit[1], fruit[0] - SHOULDER_X_M)
+    poses = []
+    for up_rad, side in ASIDE_SIGHTS:
+        off_rad, level_m = side * ASIDE_OFF_RAD, ASIDE_M * math.cos(up_rad)
+        pan_off = math.asin(min(1.0, level_m * math.sin(off_rad) / away_m))
+        r_m, pan = away_m * math.cos(pan_off) - level_m * math.cos(off_rad), bearing + pan_off
+        at = SHOULDER_X_M + r_m * math.cos(pan), r_m * math.sin(pan), fruit[2] - ASIDE_M * math.sin(up_rad)
+        try:
+            q = looking(at, math.atan(math.tan(up_rad) / math.cos(off_rad)))
+        except Refused:
+            continue
+        if not obstruction(q):
+            poses.append(q)
+    return poses
 
 
 def singular(q: Joints, sine_min: float = 0.08) -> str:
