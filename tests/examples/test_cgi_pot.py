@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import re
 import shutil
 import socket
@@ -279,6 +280,35 @@ def test_a_silent_probe_is_no_reason_to_water_and_a_dose_that_did_not_arrive_is_
     outside.now_s += 60.0
     pot.tick()
     assert pot.http.get("/tasks").json() == tasks
+
+
+def test_what_was_answered_survives_kill_9_and_the_state_is_never_unreadable(pot: Pot) -> None:
+    """Writers are killed at random moments, most of them while they work; a permit given before is there after each."""
+    rng = random.Random(5)
+    pot.tick()
+    given = Permit.model_validate_json(pot.permit("robot-1", 1, "k").raise_for_status().content)
+    state = pot.folder / "plant-5" / "state.json"
+    killed = 0
+    for i in range(30):
+        pot.outside.now_s += 0.1
+        look = subprocess.Popen(["php", "-n", "tick.php", "look"], cwd=EXAMPLE, env=pot.environment, stdin=subprocess.PIPE,
+                                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
+        assert look.stdin is not None
+        look.stdin.write(b"1.2%02d\n" % i)
+        look.stdin.close()
+        try:
+            look.wait(rng.uniform(0.0, 0.06))
+        except subprocess.TimeoutExpired:
+            look.kill()
+            killed += look.wait(10) != 0
+        told = json.loads(state.read_text())
+        assert told["permit"]["document"]["permit_id"] == given.permit_id
+        assert told["task"]["epoch"] == 1
+    print(f"{killed} of 30 killed at work")
+    assert killed >= 3
+    again = Permit.model_validate_json(pot.permit("robot-1", 1, "k").raise_for_status().content)
+    assert again.permit_id == given.permit_id
+    assert pot.permit("robot-1", 1, "other").status_code == 409
 
 
 def test_nobody_gets_in_without_a_token_of_this_garden_and_the_right_role(pot: Pot) -> None:
