@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import signal
 import tempfile
 from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
@@ -65,10 +66,7 @@ def demo(speed: float | None, data: Path | None, as_json: bool) -> None:
         listed = processes(scenario, folder.place(), World(speed=speed, fresh=True))
         for process in listed:
             (folder.root / process.name).mkdir(parents=True, exist_ok=True)
-        try:
-            asyncio.run(_play(listed, folder, Voice(as_json)))
-        except KeyboardInterrupt:
-            print("Ended early; no process is left.")
+        asyncio.run(_play(listed, folder, Voice(as_json)))
 
 
 def stage() -> Scenario:
@@ -105,6 +103,9 @@ async def _play(listed: list[Process], folder: Folder, voice: Voice) -> None:
     script = Script(runner, mesh, {peer.id: peer for peer in folder.peers_written()}, voice)
     running = asyncio.create_task(runner.run())
     acting = asyncio.create_task(script.play())
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        loop.add_signal_handler(number, acting.cancel)
     try:
         await asyncio.wait({running, acting}, return_when=asyncio.FIRST_COMPLETED)
         if running.done():
@@ -115,6 +116,8 @@ async def _play(listed: list[Process], folder: Folder, voice: Voice) -> None:
         await asyncio.gather(acting, running, return_exceptions=True)
         await mesh.aclose()
         voice.say("All processes have ended.", ended=True)
+    if acting.cancelled():
+        raise Missed("ended early, by a signal")
     acting.result()
 
 

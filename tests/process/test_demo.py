@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from signal import SIGTERM
 
 import pytest
 
@@ -48,4 +49,17 @@ def test_the_killed_robots_task_is_done_by_the_other_and_no_process_is_left(tmp_
     told = [step["what"] for step in story]
     assert told.index("its brain is killed") < told.index(f"{verdict['killed']} fell silent for 8 s")
     assert sum(what.startswith("permit ") for what in told) == 1
+    assert marked(str(tmp_path)) == []
+
+
+@pytest.mark.soak
+@pytest.mark.skipif(not Path("/proc").exists(), reason="looks for processes in /proc")
+def test_ended_by_a_signal_it_leaves_no_process_either(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "console.cli", "demo", "--json", "--data", str(tmp_path)]
+    with subprocess.Popen(command, env=os.environ | {MARK: str(tmp_path)}, stdout=subprocess.PIPE, text=True) as demo:
+        assert demo.stdout is not None
+        started = next(line for line in demo.stdout if "asked for by soil" in line)
+        assert len(marked(str(tmp_path))) >= 9, started
+        demo.send_signal(SIGTERM)
+        assert demo.wait(30) == 1
     assert marked(str(tmp_path)) == []
