@@ -21,7 +21,8 @@ from console.diagram import text, write
 from console.folder import Folder
 from console.orders import order_of, place
 from console.snapshot import all_tasks, look
-from console.story import Story, tell
+from console.story import Story, remembered, tell
+from core.allocation.epochs import owner_of
 from core.clock import Clock, WallClock
 from core.errors import BadRequest, GardenError, NotFound, PeerDown
 from core.mesh.client import Mesh
@@ -170,14 +171,18 @@ async def _find_task(line: Line, task_id: str) -> Task:
 
 async def _story(line: Line, task_id: str) -> Story:
     """The task and what everybody who knows of it remembers; who does not answer is left out."""
-    task = await _find_task(line, task_id)
-    robots = line.peers.of_kind("robot")
-    told = await line.mesh.ask_all(robots, "GET", "/history", expect=list[HistoryEntry])
-    plants = [peer for peer in line.peers.of_kind("plant") if peer.id == task.plant_id]
+    plants = [peer for peer in line.peers.of_kind("plant") if peer.id == owner_of(task_id)]
     noted = await line.mesh.ask_all(plants, "GET", f"/history?task_id={task_id}&limit=5000", expect=list[HistoryEntry])
-    own = noted.get(task.plant_id, [])
+    own = [entry for answer in noted.values() if not isinstance(answer, GardenError) for entry in answer]
+    try:
+        task = await _find_task(line, task_id)
+    except NotFound:
+        if (forgotten := remembered(task_id, own)) is None:
+            raise
+        task = forgotten
+    told = await line.mesh.ask_all(line.peers.of_kind("robot"), "GET", "/history", expect=list[HistoryEntry])
     heard = {name: answer for name, answer in told.items() if not isinstance(answer, GardenError)}
-    return tell(task, [] if isinstance(own, GardenError) else own, heard)
+    return tell(task, own, heard)
 
 
 def water(plant: str, ml: float | None, data: Path, as_json: bool) -> None:

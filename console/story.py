@@ -9,10 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
+from typing import get_args
 
 from core.allocation.auction import SILENT
+from core.allocation.epochs import owner_of
 from core.wire.documents import Document, HistoryEntry
-from core.wire.market import FINAL_STATES, Bid, BidRound, Task, TaskEvent
+from core.wire.market import FINAL_STATES, Bid, BidRound, Task, TaskEvent, TaskKind, TaskState
 
 _ENDED = re.compile(rf"({'|'.join(FINAL_STATES)}): ")
 _REPORTED = re.compile(r"(\S+) (?:reports (done|failed)|(failed))\b:? ?(.*)")
@@ -21,6 +23,15 @@ OF_ROUNDS = ("awarded to ", "nobody can take it: ")
 """Events that the rounds tell better."""
 
 NOTED_WITHIN_S = 2.0
+STATES: dict[str, TaskState] = {state: state for state in get_args(TaskState)}
+KINDS: dict[TaskKind, re.Pattern[str]] = {
+    "water": re.compile(r"^permit \S+ for \d+ ml|water content|asked by hand"),
+    "inventory": re.compile(r"has scanned|scanned$|never scanned|last scan|uncertain"),
+    "harvest": re.compile(r"ripe fruit|^permit \S+ for \S+$"),
+}
+"""A history does not say of what kind a task was; its words do."""
+_AWARDED = re.compile(r"awarded to (\S+), epoch (\d+): ")
+_ASKED = re.compile(r"asked for by (\S+): (.*)")
 
 
 class Step(Document):
@@ -56,6 +67,26 @@ def tell(task: Task, plant: Sequence[HistoryEntry], robots: Mapping[str, Sequenc
     for name, entries in robots.items():
         steps += _by_robot(task, name, entries, steps)
     return Story(task=task, steps=sorted(steps, key=attrgetter("t_s")))
+
+
+def remembered(task_id: str, entries: Sequence[HistoryEntry]) -> Task | None:
+    """A task that its plant has forgotten, as far as the plant's history still tells; None when it does not tell enough."""
+    told = [entry for entry in entries if entry.task_id == task_id and entry.kind in STATES]
+    kind = next((kind for kind, words in KINDS.items() if any(words.search(entry.what) for entry in told)), None)
+    if kind is None:
+        return None
+    events, holder, epoch = list[TaskEvent](), "", 0
+    for entry in told:
+        if won := _AWARDED.match(entry.what):
+            holder, epoch = won[1], int(won[2])
+        events.append(TaskEvent(t_s=entry.t_s, what=entry.what, robot_id=holder, epoch=epoch))
+        holder = "" if entry.kind == "announced" else holder
+    asked = _ASKED.match(told[0].what)
+    return Task(
+        task_id=task_id, kind=kind, state=STATES[told[-1].kind], plant_id=owner_of(task_id), robot_id=holder, epoch=epoch,
+        created_s=told[0].t_s, updated_s=told[-1].t_s, asked_by=asked[1] if asked else "", why=asked[2] if asked else "",
+        reason="the pot keeps only its history of this task", events=events,
+    )  # fmt: skip
 
 
 def _by_plant(task: Task) -> Iterator[Step]:

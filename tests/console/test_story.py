@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from console import diagram
-from console.story import Story, tell
+from console.story import Story, remembered, tell
 from core.allocation.plant_side import Market
 from core.allocation.plant_state import Grant, Note, Solicit
 from core.errors import ConfigError
@@ -135,6 +135,35 @@ def test_silence_refusals_and_nobody_are_told_as_what_they_were() -> None:
     ):
         assert line in told
     assert told.index(("plant-1 -> robot-1", "award, epoch 1")) < told.index(("plant-1 -> robot-1", "award, epoch 2"))
+
+
+def test_a_task_that_its_pot_has_forgotten_is_told_from_the_history_alone() -> None:
+    played = Played()
+    played.bids(0.0, robot_1=3.0, robot_2=4.0)
+    played.bids(12.0)  # robot-1 has not said a word
+    played.bids(12.0, robot_1=None, robot_2=4.0)
+    played.permit(15.0, "robot-2", 2)
+    played.report(36.0, "robot-2", 2, "done", delivered_ml=149.0)
+    played.market.soil(0.225, "", 96.0)
+    played.effects(96.0)
+    task = remembered(TASK, played.plant)
+    assert task is not None
+    whole = played.market.task(TASK)
+    assert (task.kind, task.state, task.plant_id) == ("water", "done", "plant-1")
+    assert (task.robot_id, task.epoch, task.asked_by, task.why) == ("robot-2", 2, "soil", whole.why)
+    told = [(step.who, step.what) for step in tell(task, played.plant, played.robots).steps]
+    assert told == [
+        ("plant-1", "asked for by soil: water content 0.176 is below 0.200"),
+        ("plant-1 -> robot-1", "award, epoch 1"),
+        ("plant-1", "robot-1 fell silent for 8 s"),
+        ("plant-1 -> robot-1", "kill task, epoch 1"),
+        ("plant-1 -> robot-2", "award, epoch 2"),
+        ("robot-2 -> plant-1", "may I?"),
+        ("plant-1 -> robot-2", "permit plant-1:1:p2 for 150 ml"),
+        ("robot-2 -> plant-1", "done"),
+        ("plant-1", "done: soil went from 0.176 to 0.225"),
+    ]
+    assert remembered("plant-1:1:9", played.plant) is None
 
 
 def test_the_diagram_has_the_plant_between_its_robots_and_every_message_in_order() -> None:

@@ -95,6 +95,14 @@ def test_every_state_is_in_the_table_of_states() -> None:
         assert f"`{state}`" in section
 
 
+def test_every_operation_it_names_is_one_that_the_services_have() -> None:
+    table = (DOC.parent / "security-table.md").read_text()
+    known = set(re.findall(r"^\| `(\w+ /[^`]*)` \|", table, re.MULTILINE))
+    named = {re.sub(r"\?.*", "", operation) for operation in re.findall(r"`((?:GET|POST|DELETE|PATCH|PUT) /[^`]*)`", TEXT)}
+    assert len(named) >= 12
+    assert named <= known
+
+
 # ------------------------------------------------------------------ figure 13
 
 
