@@ -25,9 +25,11 @@ OF_ROUNDS = ("awarded to ", "nobody can take it: ")
 NOTED_WITHIN_S = 2.0
 STATES: dict[str, TaskState] = {state: state for state in get_args(TaskState)}
 KINDS: dict[TaskKind, re.Pattern[str]] = {
-    "water": re.compile(r"^permit \S+ for \d+ ml|water content|asked by hand"),
-    "inventory": re.compile(r"has scanned|scanned$|never scanned|last scan|uncertain"),
-    "harvest": re.compile(r"ripe fruit|^permit \S+ for \S+$"),
+    "water": re.compile(r"^permit \S+ for \d+ ml|^asked for by \S+: water content"),
+    "inventory": re.compile(
+        r"has scanned$|^asked for by \S+: (this plant was|the last scan|what is known|nobody told|.*looked at)"
+    ),
+    "harvest": re.compile(r"^permit \S+ for \S+$|^asked for by \S+: (\d+ ripe fruit|order )"),
 }
 """A history does not say of what kind a task was; its words do."""
 _AWARDED = re.compile(r"awarded to (\S+), epoch (\d+): ")

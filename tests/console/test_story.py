@@ -166,6 +166,26 @@ def test_a_task_that_its_pot_has_forgotten_is_told_from_the_history_alone() -> N
     assert remembered("plant-1:1:9", played.plant) is None
 
 
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("water", ["asked for by operator: asked by hand", "permit plant-1:1:p2 for 90 ml"]),
+        ("water", ["asked for by soil: water content 0.190 has not reached 0.240"]),
+        ("inventory", ["asked for by operator: asked by hand", "robot-2 has scanned"]),
+        ("inventory", ["asked for by fruit: nobody told how the pick of f3 ended"]),
+        ("inventory", ["asked for by fruit: f1, f2 should be looked at: ripe by now"]),
+        ("harvest", ["asked for by operator: asked by hand", "permit plant-1:1:p4 for plant-1:f3"]),
+        ("harvest", ["asked for by console: order o1767", "nobody told how the pick of f3 ended: a scan comes first"]),
+        ("harvest", ["asked for by fruit: 2 ripe fruit"]),
+        (None, ["asked for by operator: asked by hand", "cancelled: cancelled by operator"]),
+    ],
+)
+def test_of_what_kind_a_forgotten_task_was_is_read_from_its_words(kind: str | None, words: list[str]) -> None:
+    entries = [HistoryEntry(id=i, t_s=float(i), kind="announced", what=what, task_id=TASK) for i, what in enumerate(words)]
+    task = remembered(TASK, entries)
+    assert (task and task.kind) == kind
+
+
 def test_the_diagram_has_the_plant_between_its_robots_and_every_message_in_order() -> None:
     drawn = diagram.text(fig13()).splitlines()
     print("\n".join(drawn))
