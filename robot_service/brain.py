@@ -7,7 +7,7 @@ import random
 
 import httpx
 
-from core.allocation.bidding import OTHER_WORK_S, Condition, Stop, price, work_s
+from core.allocation.bidding import OTHER_WORK_S, Condition, Stop, insertion, price, work_s
 from core.allocation.epochs import owner_of
 from core.allocation.queue import Entry, TaskQueue
 from core.clock import Clock
@@ -43,6 +43,8 @@ from robot_service.settings import NEED_EYE, RobotSettings
 TURNING_S = 3.0
 STOP_ANSWER_S = 2.0
 STOPPED_BY_CHARS = 200
+OVERTAKEN_FOR_S = 300.0
+"""A task that has waited so long is not put back any more."""
 DRIVE_RATIO = 1.15
 """Driven time over length / cruise: corners and braking."""
 
@@ -214,10 +216,13 @@ class Brain:
     def _stop(self, entry: Entry) -> Stop:
         if (asked := entry.announcement) is not None:
             labour_s = work_s(asked.kind, asked.dose_ml, asked.count)
-            return Stop(dock=entry.plant_id, work_s=labour_s, dose_ml=asked.dose_ml, task_id=entry.task_id)
+            return Stop(
+                dock=entry.plant_id, work_s=labour_s, dose_ml=asked.dose_ml, task_id=entry.task_id,
+                priority=asked.priority, settled=self.clock.now() - entry.since_s > OVERTAKEN_FOR_S,
+            )  # fmt: skip
         charge, refill = entry.kind == "charge", entry.kind == "refill"
         dock = "" if charge or refill else self.robot.where.docked_at
-        return Stop(dock=dock, work_s=OTHER_WORK_S, task_id=entry.task_id, charge=charge, refill=refill)
+        return Stop(dock=dock, work_s=OTHER_WORK_S, task_id=entry.task_id, charge=charge, refill=refill, settled=True)
 
     def _at_work_s(self, running: Entry) -> float:
         """How long it has been at what it came for."""
@@ -234,7 +239,8 @@ class Brain:
             raise Unprocessable(f"{plant_id} is not a plant we know")
         if award.announcement.kind not in self._can():
             raise Unprocessable(f"cannot {award.announcement.kind}")
-        entry = self.queue.award(award, self.clock.now())
+        at = insertion(award.announcement, self.condition())
+        entry = self.queue.award(award, self.clock.now(), at)
         self.robot.note("award", f"{entry.kind} for {plant_id}", task_id=entry.task_id, epoch=entry.epoch)
         self.scheduler.changed()
         self.reporter.soon()

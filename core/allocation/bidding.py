@@ -7,7 +7,7 @@ Source: paper 000, section 7 (cost of distance, queue and abilities); charge and
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from core.robots import gardener
 from core.wire.market import Announcement, Bid, Breakdown, TaskKind
@@ -50,6 +50,9 @@ class Stop:
     task_id: str = ""
     charge: bool = False
     refill: bool = False
+    priority: int = 5
+    settled: bool = False
+    """Nothing may be put before it any more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +74,7 @@ class Condition:
     at_work_s: float = 0.0
     """How long it has stood at the dock of what is running."""
     queue: tuple[Stop, ...] = ()
+    """What waits, in the order in which it will be done."""
     taps: tuple[str, ...] = ()
     chargers: tuple[str, ...] = ()
 
@@ -84,7 +88,8 @@ class _Walk:
     docked: bool
     tank_ml: float
     battery_ratio: float
-    spent: Breakdown = field(default_factory=Breakdown)
+    refilled_s: float = 0.0
+    """What of it went into ways to the tap and filling there."""
 
     def go(self, dock: str) -> float | None:
         """Drive there and dock; the seconds it takes."""
@@ -107,8 +112,25 @@ class _Walk:
         known = {dock: time_s for dock, time_s in times.items() if time_s is not None}
         return min(known, key=lambda dock: (known[dock], dock)) if known else None
 
-    def serve(self, stop: Stop, done_s: float = 0.0) -> float | None:
-        """Go there and do it, `done_s` of the work being done already; the seconds it takes, None when there is no way."""
+    def drink(self, dose_ml: float) -> float | None:
+        """Seconds until there is water for a dose: none, or the nearest tap's; None when no tap can be reached."""
+        if dose_ml == 0.0 or dose_ml + TANK_RESERVE_ML <= self.tank_ml:
+            return 0.0
+        tap = self.nearest(self.me.taps)
+        if tap is None or (way_s := self.go(tap)) is None:
+            return None
+        spent_s = way_s + refill_s(max(0.0, self.tank_ml))
+        self.tank_ml, self.refilled_s = gardener.TANK_ML, self.refilled_s + spent_s
+        return spent_s
+
+    def serve(self, stop: Stop) -> float | None:
+        """Fetch water if need be, go there and do it; the seconds it takes, None when there is no way."""
+        water_s = self.drink(stop.dose_ml)
+        spent_s = None if water_s is None else self.finish(stop, 0.0)
+        return None if water_s is None or spent_s is None else water_s + spent_s
+
+    def finish(self, stop: Stop, done_s: float) -> float | None:
+        """Go there and do what is left of it, `done_s` of the work being done; the seconds it takes."""
         me = self.me
         dock = stop.dock or self.nearest(me.taps if stop.refill else me.chargers if stop.charge else ()) or self.place
         travel_s = 0.0 if dock == "here" else self.go(dock)
@@ -148,24 +170,66 @@ def refill_s(tank_ml: float) -> float:
 
 
 def price(asked: Announcement, me: Condition) -> Bid:
-    """The bid for `asked`: feasible with its breakdown, or cost None and the reason."""
+    """The bid for `asked`: feasible with its breakdown, or cost None and the reason.
+
+    A task that is held already is priced where it stands: seconds until it would be done. Any other goes where it adds
+    least to the queue (cheapest insertion), and its price is when all that is promised would be done with it (min-max).
+    """
+    return _best(asked, me)[0]
+
+
+def insertion(asked: Announcement, me: Condition) -> int:
+    """Where in the queue `price` saw the task: what stands there, and all behind it, moves back."""
+    return _best(asked, me)[1]
+
+
+def _best(asked: Announcement, me: Condition) -> tuple[Bid, int]:
     if reason := _unable(asked, me):
-        return _no(asked, me, reason)
-    walk = _Walk(me, "here", bool(me.docked_at), me.tank_ml or 0.0, me.battery_ratio)
-    if me.docked_at:
-        walk.place = me.docked_at
-    held = me.current is not None and me.current.task_id == asked.task_id
-    ahead = _before(asked.task_id, me.queue)
-    cost = Breakdown()
-    if me.current is not None:
-        cost = Breakdown(current_s=max(REST_MIN_S, walk.serve(me.current, me.at_work_s) or 0.0))
-    if held:
-        return _yes(asked, me, cost)
-    for stop in ahead:
+        return _no(asked, me, reason), len(me.queue)
+    if me.current is not None and me.current.task_id == asked.task_id:
+        return _yes(asked, me, _begun(me)[1]), 0
+    for index, stop in enumerate(me.queue):
+        if stop.task_id == asked.task_id:
+            return _inserted(asked, replace(me, queue=me.queue[:index]), index), index
+    tried = ((_inserted(asked, me, index), index) for index in _places(asked.priority, me.queue))
+    return min(tried, key=lambda each: (each[0].cost_s is None, each[0].cost_s or 0.0, -each[1]))
+
+
+def _places(priority: int, queue: tuple[Stop, ...]) -> range:
+    """Where a task may be put in: behind all that is more urgent or settled, before all that is less urgent."""
+    first = max((i + 1 for i, stop in enumerate(queue) if stop.settled or stop.priority > priority), default=0)
+    last = next((i for i in range(first, len(queue)) if queue[i].priority < priority), len(queue))
+    return range(first, last + 1)
+
+
+def _begun(me: Condition) -> tuple[_Walk, Breakdown]:
+    """The robot of the imagination once it is done with what is running."""
+    walk = _Walk(me, me.docked_at or "here", bool(me.docked_at), me.tank_ml or 0.0, me.battery_ratio)
+    if me.current is None:
+        return walk, Breakdown()
+    return walk, Breakdown(current_s=max(REST_MIN_S, walk.finish(me.current, me.at_work_s) or 0.0))
+
+
+def _inserted(asked: Announcement, me: Condition, index: int) -> Bid:
+    """The bid with the task at this place of the queue: what others need without it, and what it adds."""
+    walk, cost = _begun(me)
+    plain = replace(walk)
+    for stop in me.queue[:index]:
         if (spent_s := walk.serve(stop)) is None:
             return _no(asked, me, f"no way to {stop.dock}, which is earlier in the queue")
         cost = cost.model_copy(update={"queue_s": cost.queue_s + spent_s})
-    return _finish(asked, me, walk, cost)
+    bid = _finish(asked, me, walk, cost)
+    if index == len(me.queue) or bid.cost_s is None or bid.breakdown is None:
+        return bid
+    behind_s = [walk.serve(stop) for stop in me.queue[index:]]
+    alone_s = [plain.serve(stop) for stop in me.queue]
+    if None in behind_s or None in alone_s:
+        return _no(asked, me, "no way to what is later in the queue")
+    own, all_s = bid.breakdown, bid.cost_s + sum(filter(None, behind_s))
+    queue_s = sum(filter(None, alone_s)) - plain.refilled_s
+    travel_s = all_s - cost.current_s - queue_s - own.work_s - own.charge_s - walk.refilled_s
+    more = {"queue_s": queue_s, "travel_s": travel_s, "refill_s": walk.refilled_s}
+    return _yes(asked, me, own.model_copy(update=more))
 
 
 def _unable(asked: Announcement, me: Condition) -> str:
@@ -187,22 +251,11 @@ def _unable(asked: Announcement, me: Condition) -> str:
     return ""
 
 
-def _before(task_id: str, queue: tuple[Stop, ...]) -> tuple[Stop, ...]:
-    """What is done before this task: all of the queue, or what lies ahead of it when it is queued already."""
-    for index, stop in enumerate(queue):
-        if stop.task_id == task_id:
-            return queue[:index]
-    return queue
-
-
 def _finish(asked: Announcement, me: Condition, walk: _Walk, cost: Breakdown) -> Bid:
     """Add refill and charge where needed, then the way and the work."""
-    if asked.dose_ml + TANK_RESERVE_ML > walk.tank_ml:
-        tap = walk.nearest(me.taps)
-        way_s = walk.go(tap) if tap else None
-        if way_s is None:
-            return _no(asked, me, f"the tank holds {walk.tank_ml:.0f} ml and no tap can be reached")
-        cost = cost.model_copy(update={"refill_s": way_s + refill_s(max(0.0, walk.tank_ml))})
+    if (water_s := walk.drink(asked.dose_ml)) is None:
+        return _no(asked, me, f"the tank holds {walk.tank_ml:.0f} ml and no tap can be reached")
+    cost = cost.model_copy(update={"refill_s": water_s})
     if walk.battery_ratio < BATTERY_FORCED_RATIO:
         charger = walk.nearest(me.chargers)
         way_s = walk.go(charger) if charger else None
@@ -212,6 +265,7 @@ def _finish(asked: Announcement, me: Condition, walk: _Walk, cost: Breakdown) ->
     travel_s = walk.go(asked.plant.plant_id)
     if travel_s is None:
         return _no(asked, me, f"no way to the dock of {asked.plant.plant_id}")
+    walk.tank_ml -= asked.dose_ml
     work = work_s(asked.kind, asked.dose_ml, asked.count)
     return _yes(asked, me, cost.model_copy(update={"travel_s": travel_s, "work_s": work}))
 

@@ -39,6 +39,8 @@ class Entry:
     """Why it was taken away; empty while it is ours."""
     phase: str = ""
     progress: float = 0.0
+    since_s: float = float("-inf")
+    """When it was promised."""
     picks: list[Pick] = field(default_factory=list)
     """`harvest`: how each fruit's pick ended so far."""
 
@@ -50,8 +52,11 @@ class TaskQueue:
     entries: list[Entry] = field(default_factory=list)
     _epochs: OrderedDict[str, int] = field(default_factory=OrderedDict)
 
-    def award(self, award: Award, now_s: float) -> Entry:
-        """Take an award; the same one again returns the entry it made. Raises Refused for a stale epoch or a full queue."""
+    def award(self, award: Award, now_s: float, at: int | None = None) -> Entry:
+        """Take an award; the same one again returns the entry it made. Raises Refused for a stale epoch or a full queue.
+
+        A new task goes before the one that is number `at` of what has not begun; None: to the end.
+        """
         asked = award.announcement
         held = self.find(asked.task_id)
         if held is not None and held.epoch == award.epoch and not held.killed:
@@ -64,9 +69,9 @@ class TaskQueue:
         if held is None and len(self.entries) >= QUEUE_MAX:
             raise Refused(f"the queue is full with {QUEUE_MAX} tasks")
         self._remember(asked.task_id, award.epoch)
-        return self._take(held, award, now_s)
+        return self._take(held, award, now_s, at)
 
-    def _take(self, held: Entry | None, award: Award, now_s: float) -> Entry:
+    def _take(self, held: Entry | None, award: Award, now_s: float, at: int | None = None) -> Entry:
         if held is not None and not held.killed:
             held.epoch, held.lease_s, held.lease_until_s = award.epoch, award.lease_s, now_s + award.lease_s
             return held
@@ -79,8 +84,9 @@ class TaskQueue:
             announcement=asked,
             lease_s=award.lease_s,
             lease_until_s=now_s + award.lease_s,
+            since_s=now_s,
         )
-        self.entries.append(entry)
+        self.entries.insert(len(self.entries) if at is None else self._begun() + at, entry)
         return entry
 
     def _remember(self, task_id: str, epoch: int) -> None:
@@ -93,8 +99,11 @@ class TaskQueue:
         """An operator's job at the end, an errand of our own in front of everything that has not begun."""
         if len(self.entries) >= QUEUE_MAX:
             raise Refused(f"the queue is full with {QUEUE_MAX} tasks")
-        running = 1 if self.entries and self.entries[0].running else 0
-        self.entries.insert(running if first else len(self.entries), entry)
+        self.entries.insert(self._begun() if first else len(self.entries), entry)
+
+    def _begun(self) -> int:
+        """How many entries are running: the first, or none."""
+        return 1 if self.entries and self.entries[0].running else 0
 
     def find(self, task_id: str) -> Entry | None:
         return next((entry for entry in self.entries if entry.task_id == task_id), None)

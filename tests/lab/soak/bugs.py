@@ -75,8 +75,8 @@ def a_full_disk_is_a_success():
 def an_award_is_queued_again():
     """The robot takes the same award every time it comes."""
 
-    def greedy(self, award, now_s):
-        return self._take(None, award, now_s)
+    def greedy(self, award, now_s, at=None):
+        return self._take(None, award, now_s, at)
 
     with mock.patch.object(TaskQueue, "award", greedy):
         yield
@@ -113,8 +113,8 @@ def the_robot_counts_on_a_longer_lease():
     """It reports a quarter of twenty leases apart."""
     real = TaskQueue._take
 
-    def patient(self, held, award, now_s):
-        return real(self, held, award.model_copy(update={"lease_s": 20 * award.lease_s}), now_s)
+    def patient(self, held, award, now_s, at=None):
+        return real(self, held, award.model_copy(update={"lease_s": 20 * award.lease_s}), now_s, at)
 
     with mock.patch.object(TaskQueue, "_take", patient):
         yield

@@ -11,6 +11,7 @@ from core.allocation.bidding import (
     Condition,
     Stop,
     charge_s,
+    insertion,
     price,
     refill_s,
     total_s,
@@ -94,6 +95,36 @@ def test_an_errand_that_began_costs_what_it_was_said_to_cost_on_the_way(where):
     assert begun.cost_s == pytest.approx(before.cost_s)
 
 
+def test_a_task_goes_where_it_adds_least_and_costs_until_all_is_done():
+    far = Stop(dock="far", work_s=30.0, task_id="far:1")
+    busy = replace(ME, queue=(far,))
+    assert insertion(asked("near"), busy) == 0
+    bid = price(asked("near"), busy)
+    by_hand_s = (10.0 + DOCKING_S) + work_s("water", 150.0) + (UNDOCKING_S + 30.0 + DOCKING_S) + 30.0
+    assert bid.cost_s == pytest.approx(by_hand_s)
+    assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
+    assert bid.breakdown.queue_s == pytest.approx(40.0 + DOCKING_S + 30.0)
+    near = Stop(dock="near", work_s=30.0, task_id="near:0")
+    assert insertion(asked("far", task_id="far:1"), replace(ME, queue=(near,))) == 1
+
+
+def test_nothing_overtakes_what_is_settled_or_more_urgent_and_the_urgent_overtakes():
+    far, settled = Stop(dock="far", work_s=30.0), Stop(dock="far", work_s=30.0, settled=True)
+    assert insertion(asked("near"), replace(ME, queue=(settled,))) == 1
+    near = Stop(dock="near", work_s=30.0)
+    assert insertion(asked("spare"), replace(ME, queue=(far, near))) == 1
+    assert insertion(asked("spare"), replace(ME, queue=(far, settled, near))) == 2
+    assert insertion(asked("near"), replace(ME, queue=(replace(far, priority=7),))) == 1
+    urgent = asked("far").model_copy(update={"priority": 9})
+    assert insertion(urgent, replace(ME, queue=(Stop(dock="near", work_s=30.0), far))) == 0
+
+
+def test_a_task_that_is_held_is_priced_where_it_stands():
+    near, far = Stop(dock="near", work_s=30.0, task_id="near:1"), Stop(dock="far", work_s=30.0, task_id="far:1")
+    assert price(asked("near"), replace(ME, queue=(near, far))).cost_s == price(asked("near"), ME).cost_s
+    assert insertion(asked("near"), replace(ME, queue=(far, near))) == 1
+
+
 def test_a_charging_robot_is_free_once_it_has_enough():
     charging = replace(ME, docked_at="spare", battery_ratio=0.3, current=Stop(dock="", charge=True))
     assert price(asked(), charging).breakdown.current_s == pytest.approx(charge_s(0.3))
@@ -109,7 +140,11 @@ def test_a_task_in_the_queue_already_is_priced_where_it_stands():
 def test_water_promised_to_earlier_tasks_is_not_there_for_later_ones():
     thirsty = replace(ME, tank_ml=200.0, queue=(Stop(dock="far", work_s=1.0, dose_ml=150.0),))
     bid = price(asked(), thirsty)
-    assert bid.breakdown.refill_s == pytest.approx(UNDOCKING_S + 20.0 + DOCKING_S + refill_s(50.0))
+    assert insertion(asked(), thirsty) == 0
+    assert bid.breakdown.refill_s == pytest.approx(UNDOCKING_S + 10.0 + DOCKING_S + refill_s(50.0))
+    assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
+    settled = replace(thirsty, queue=(replace(thirsty.queue[0], settled=True),))
+    assert price(asked(), settled).breakdown.refill_s == pytest.approx(UNDOCKING_S + 20.0 + DOCKING_S + refill_s(50.0))
     assert price(asked(), replace(ME, tank_ml=200.0)).breakdown.refill_s == 0.0
 
 
