@@ -32,7 +32,7 @@ STEP_M = 0.015
 PULL_TILTS_RAD = (0.30, -0.30, 0.0)
 """The hand tips up or down while it pulls: the stalk bends over its knuckle and breaks at less force. In order of liking."""
 PULL_LIFTS_RAD = (0.0, 0.35, -0.35, 0.7)
-"""So much steeper than it came the hand goes back with the fruit, where others hang in front of it. In order of liking."""
+"""The way back leads so much further up than the hand came, where others hang in front. In order of liking."""
 PULL_SHARES, TILTED_SHARE = (0.15, 0.3, 0.45, 0.6, 0.8, 1.0), 0.6
 """Steps of the way back; after `TILTED_SHARE` of it the hand is tipped wholly."""
 ROOM_PULLED_M = 0.002
