@@ -24,6 +24,8 @@ from sim.truth import FruitTruth
 
 BUSY_S, REST_S = 1.0, 5.0
 """How often a busy and a resting garden is looked at."""
+PROBE_EVERY_S = 60.0
+"""The pots are moist and nobody waters: they look at their soil, and think, once a minute instead of every ten seconds."""
 LOOK_S = 600.0
 """How often the judge goes round."""
 FORECAST_S = DAY_S / 4
@@ -132,6 +134,7 @@ def live(scenario: Scenario, days: float, seed: int, detector: str = "best") -> 
 async def _live(scenario: Scenario, days: float, seed: int, detector: str, folder: Path) -> Days:
     name = stand_in.NAME if detector == "stand-in" else detector
     settings = {robot.id: {"ROBOT_DETECTOR": name} for robot in scenario.robots}
+    settings |= {plant.id: {"PLANT_PROBE_EVERY_S": f"{PROBE_EVERY_S:g}"} for plant in scenario.plants}
     async with Garden(scenario, folder, seed=seed, settings=settings) as garden:
         with stand_in.looking_at(garden, ROBOT):
             judge = _Judge(garden, Days(seed, days))
