@@ -20,6 +20,7 @@ EXPERIMENTS = {
     "detector": "lab.experiments.detector:detector_experiment",
     "square-loop": "lab.experiments.square_loop:square_loop",
     "watering": "lab.experiments.watering:watering",
+    "allocation": "lab.experiments.allocation:allocation",
     "network": "lab.experiments.network:network",
     "inventory": "lab.experiments.inventory:inventory",
     "grasp": "lab.experiments.grasp:grasp",
