@@ -28,6 +28,10 @@ FRESH_S = 8.0
 """A camera that gives no new picture within this time [s of the wall] is silent; the driver itself waits less."""
 
 
+ACCURACY = {"best": Accuracy(recall=0.92, precision=0.94), "features": Accuracy(recall=0.70, precision=0.56)}
+"""Of a detector by its name, any fruit in frames of gardens it had not seen (docs/detectors.md); of others the paper's."""
+
+
 class Frame(Protocol):
     """One picture of the driver."""
 
@@ -72,7 +76,7 @@ class Eye:
         self._detectors: tuple[Detector, Detector, float] | None = None
         self.camera = replace(lens, distortion=NO_DISTORTION)
         """What the circles of a `Look` obey."""
-        self.accuracy = accuracy or Accuracy()
+        self.accuracy = accuracy or ACCURACY.get(detector_name, Accuracy())
         self.last: Look | None = None
         self._shown: tuple[float, bytes] | None = None
         self._showing = asyncio.Lock()
