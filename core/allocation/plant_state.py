@@ -30,6 +30,8 @@ class Rules:
     lease_s: float = LEASE_S
     reallocate_s: float = REALLOCATE_S
     margin_ratio: float = REALLOCATE_MARGIN_RATIO
+    moves_max: int = 1
+    """How often a task moves for a better price before it ends or its holder fails."""
     permit_valid_s: float = permits.PERMIT_VALID_S
     backoff_s_min: float = 1.0
     backoff_s_max: float = 30.0
@@ -126,6 +128,8 @@ class Live:
     cost_s: float = 0.0
     running_since_s: float = math.inf
     round: Round | None = None
+    moves: int = 0
+    """How often it went to a better price since it was last announced."""
     silent: bool = False
     """The lease ended while a permit was open."""
     told: str = ""

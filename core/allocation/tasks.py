@@ -186,7 +186,10 @@ class TaskBook:
         best = better_than_holder(bids, task.robot_id, self.rules.margin_ratio)
         if best is None:
             return
-        own = next(bid for bid in bids if bid.robot_id == task.robot_id)
+        own, live = next(bid for bid in bids if bid.robot_id == task.robot_id), self._live[task.task_id]
+        if own.cost_s is not None and live.moves >= self.rules.moves_max:
+            return
+        live.moves += 1
         was = f"{own.cost_s:.1f} s" if own.cost_s is not None else f"no bid ({own.reason})"
         cost_s = best.cost_s or 0.0
         why = f"moved from {task.robot_id}, now {was}, to {best.robot_id} at {cost_s:.1f} s"

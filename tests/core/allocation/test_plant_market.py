@@ -115,6 +115,24 @@ def test_the_round_closes_at_the_window_without_the_silent_one() -> None:
     assert made.task(task_id).rounds[0].bids[0].reason == "did not answer"
 
 
+def test_prices_that_sway_move_a_task_once_and_a_holder_that_cannot_always_loses_it() -> None:
+    made = market()
+    task_id = awarded(made)
+
+    def asked_again(now_s: float, one: float | None, other: float | None) -> str:
+        holder, epoch = made.task(task_id).robot_id, made.task(task_id).epoch
+        made.report(task_id, Report(robot_id=holder, epoch=epoch, state="awarded"), now_s)
+        made.tick(now_s, ROBOTS[:2])
+        (ask,) = [e for e in made.take_effects() if isinstance(e, Solicit)]
+        for robot_id, cost_s in (("robot-1", one), ("robot-2", other)):
+            made.bid(task_id, ask.round_number, robot_id, bid(robot_id, cost_s, task_id), now_s)
+        return made.task(task_id).robot_id
+
+    assert asked_again(11.0, 9.0, 4.0) == "robot-2"
+    assert asked_again(22.0, 1.0, 9.0) == "robot-2"
+    assert asked_again(33.0, 1.0, None) == "robot-1"
+
+
 def test_an_unacknowledged_award_is_sent_again_until_the_lease_ends() -> None:
     made = market()
     task_id = awarded(made)
