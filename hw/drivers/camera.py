@@ -41,7 +41,7 @@ SAME_MAX, AGAIN_S = 3, 0.15
 BLACK_LEVEL, BLOCK_PX = 24.0, 8
 """A picture is black when no block of so many pixels is brighter on average (0-255): a covered sensor still has noise."""
 BURNT_LEVEL, BURNT_SHARE = 250, 0.5
-"""A picture is burnt out when more than this share of it is as bright as this."""
+"""A picture is burnt out when more than this share of it is as bright as this in any colour: grass burns green first."""
 PICTURE_BYTES_MAX = 16 * 1024 * 1024
 DECODE_COST_S, READ_COST_S = 0.004, 0.03
 
@@ -192,7 +192,7 @@ def unfit(image: Image) -> None:
     bright = image[:rows, :columns].max(axis=2).reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
     if bright.mean(axis=(1, 3)).max(initial=0.0) < BLACK_LEVEL:
         raise CameraUnfit(CameraState.BLACK, "the picture is black; is the lens covered?")
-    if (image[::4, ::4].min(axis=2) >= BURNT_LEVEL).mean() > BURNT_SHARE:
+    if (image[::4, ::4].max(axis=2) >= BURNT_LEVEL).mean() > BURNT_SHARE:
         raise CameraUnfit(CameraState.OVEREXPOSED, "the picture is burnt out: too much light, or a stuck exposure")
 
 

@@ -126,6 +126,7 @@ def test_a_frozen_camera_is_known_from_the_first_look_on_and_again_after_it_was_
         (lambda n: picture(n, 5.0, 9.0), CameraState.BLACK),
         (lambda n: picture(0, 0.0, 0.0), CameraState.BLACK),
         (lambda n: picture(n, 300.0, 30.0), CameraState.OVEREXPOSED),
+        (lambda n: (picture(n, 300.0, 30.0) * (0.4, 1.0, 0.3)).astype(np.uint8), CameraState.OVEREXPOSED),
     ],
 )
 def test_a_covered_and_a_dazzled_lens_are_told_apart_and_recovered_from(
