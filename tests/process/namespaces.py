@@ -126,9 +126,13 @@ class Namespaces:
 
     def get(self, host: int, path: str) -> Any:
         """Ask a host's node from that host itself; None while it does not answer."""
+        return self.ask(host, self.url(host) + path)
+
+    def ask(self, host: int, url: str) -> Any:
+        """GET a JSON document as if from that host; None while nobody answers."""
         netns.pushns(self.space(host))
         try:
-            with urllib.request.urlopen(self.url(host) + path, timeout=2) as answer:
+            with urllib.request.urlopen(url, timeout=2) as answer:
                 return json.loads(answer.read())
         except (urllib.error.URLError, ConnectionError, TimeoutError):
             return None
