@@ -20,6 +20,7 @@ from pyroute2 import netns
 
 PORT = 8100
 BABEL = """reflect-kernel-metric true
+smoothing-half-life 0
 default type wired rxcost 1 hello-interval 1 update-interval 4
 redistribute local ip 10.77.0.0/24 eq 32 allow
 redistribute local deny
@@ -81,7 +82,8 @@ class Namespaces:
             _run("ip", "netns", "add", self.space(host))
             self.ip(host, "link", "set", "lo", "up")
             self.ip(host, "addr", "add", f"{self.address(host)}/32", "dev", "lo")
-            self.inside(host, "sysctl", "-qw", "net.ipv4.ip_forward=1")
+            # Addresses without a wait for duplicates: babeld must not begin while links have none.
+            self.inside(host, "sysctl", "-qw", "net.ipv4.ip_forward=1", "net.ipv6.conf.default.accept_dad=0")
         for a, b in links:
             self.link(a, b)
 
