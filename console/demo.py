@@ -18,14 +18,14 @@ from typing import Any
 
 from console import diagram, toml
 from console.folder import Folder
-from console.ports import taken
+from console.ports import on_free_ports
 from console.processes import Process, World, processes
 from console.runner import Runner
 from console.story import Step, Story, tell
 from console.up import Voice, only_one
 from core import scenario as scenarios
 from core.clock import WallClock
-from core.errors import ConfigError, GardenError, PeerDown
+from core.errors import GardenError, PeerDown
 from core.mesh.chassis import Readiness
 from core.mesh.client import Mesh
 from core.mesh.http import HttpTransport
@@ -43,7 +43,6 @@ STAGE_WITHIN_S = 180.0
 """Any one thing that should happen takes no longer than this, on the slowest machine [wall s]."""
 ON_THE_WAY_M = 0.25
 """So far it drives before it is killed: no longer at home, not yet in front of the dock."""
-SHIFTS = range(0, 6000, 300)
 
 
 class Missed(GardenError):
@@ -59,7 +58,7 @@ def demo(speed: float | None, data: Path | None, as_json: bool) -> None:
         folder = Folder(root)
         folder.root.mkdir(parents=True, exist_ok=True)
         stack.enter_context(only_one(folder))
-        scenario = on_free_ports(stage(), folder)
+        scenario = on_free_ports(stage(), folder.place())
         folder.scenario_file.write_text(toml.dump(scenario))
         folder.enrol(scenario)
         folder.remember(scenario)
@@ -85,16 +84,6 @@ def stage() -> Scenario:
         if plant.id in POTS
     ]
     return base.model_copy(update={"name": "demo", "plants": tuple(plants)})
-
-
-def on_free_ports(scenario: Scenario, folder: Folder) -> Scenario:
-    """Beside any garden that runs already; raises ConfigError when no room is left."""
-    for shift in SHIFTS:
-        moved = toml.shifted(scenario, shift)
-        busy = taken(processes(moved, folder.place()))
-        if not busy:
-            return moved
-    raise ConfigError(busy[0].told(), hint="stop what holds the ports, then try again")
 
 
 async def _play(listed: list[Process], folder: Folder, voice: Voice) -> None:

@@ -8,9 +8,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from console.processes import Process
+from console import toml
+from console.processes import Place, Process, processes
+from core.errors import ConfigError
+from core.scenario import Scenario
 
 _LISTENING = "0A"
+SHIFT, SHIFTS = 300, 70
+"""Gardens beside one another lie so many ports apart; so many places are tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +34,15 @@ def taken(processes: Iterable[Process]) -> list[Taken]:
     """Every wanted port that cannot be bound now."""
     wanted = [(port, process.name) for process in processes for port in (process.port, *process.devices) if port]
     return [Taken(port, name, holder(port)) for port, name in wanted if not is_free(port)]
+
+
+def on_free_ports(scenario: Scenario, place: Place, first: int = 0) -> Scenario:
+    """The scenario moved by `first` ports or more to where none is in use; raises ConfigError when no room is left."""
+    for shift in range(first, first + SHIFTS * SHIFT, SHIFT):
+        moved = toml.shifted(scenario, shift)
+        if not (busy := taken(processes(moved, place))):
+            return moved
+    raise ConfigError(busy[0].told(), hint="stop what holds the ports, then try again")
 
 
 def is_free(port: int, host: str = "127.0.0.1") -> bool:

@@ -24,7 +24,7 @@ import numpy as np
 
 from console import toml
 from console.folder import Folder
-from console.ports import taken
+from console.ports import on_free_ports
 from console.processes import Process, World, processes
 from console.runner import Runner
 from core.clock import WallClock
@@ -33,7 +33,6 @@ from core.mesh.chassis import Readiness
 from core.mesh.client import Mesh
 from core.mesh.http import HttpTransport
 from core.mesh.peers import Peer
-from core.scenario import Scenario
 from core.wire.body import BodyState, LineBuffer, decode
 from core.wire.market import Announcement, Bid, Task, TaskRequest
 from core.wire.plant import PlantState
@@ -91,7 +90,7 @@ def _row(name: str, ours: float, n: int, most: float | None) -> Row:
 
 async def _watch(root: Path, seconds: float) -> Watched:
     folder, watched = Folder(root), Watched()
-    scenario = _on_free_ports(garden_of(), folder)
+    scenario = on_free_ports(garden_of(), folder.place(), 2000 + os.getpid() % 400 * 30)
     folder.scenario_file.write_text(toml.dump(scenario))
     folder.enrol(scenario)
     listed = [p for p in processes(scenario, folder.place(), World(seed=SEED, speed=SPEED)) if p.kind != "console"]
@@ -111,15 +110,6 @@ async def _watch(root: Path, seconds: float) -> Watched:
             with contextlib.suppress(asyncio.CancelledError):
                 await running
     return watched
-
-
-def _on_free_ports(scenario: Scenario, folder: Folder) -> Scenario:
-    first = 2000 + os.getpid() % 400 * 30
-    for shift in range(first, first + 20000, 300):
-        moved = toml.shifted(scenario, shift)
-        if not taken(processes(moved, folder.place())):
-            return moved
-    raise ConfigError("no free ports")
 
 
 def _through(process: Process, tap: Path) -> Process:

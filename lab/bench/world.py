@@ -23,8 +23,7 @@ import mujoco
 
 from console import toml
 from console.folder import Folder
-from console.ports import taken
-from console.processes import processes
+from console.ports import on_free_ports
 from core.errors import ConfigError
 from core.scenario import Scenario, find
 from core.virtual import run_virtual
@@ -41,7 +40,7 @@ BUSY_AFTER_S, BUSY_S = 3.0, 42.0
 DAY_S, DAY_CPU_S_MAX = 86400.0, 60.0
 IDLE_CORES_MAX, IDLE_WALL_S, IDLE_SETTLE_S, IDLE_WITHIN_S = 0.3, 20.0, 50.0, 240.0
 THIRSTY_RATIO, MOIST_RATIO = 0.15, 0.38
-SHIFTS = range(1000, 20000, 700)
+FIRST_SHIFT = 1000
 
 Row = dict[str, Any]
 
@@ -153,7 +152,7 @@ async def _spent_s(garden: Garden, seconds: float) -> float:
 @contextmanager
 def _up(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], Scenario]]:
     """`garden up` of a moist garden on free ports; ends with the context."""
-    scenario = _on_free_ports(_with_moisture(find("garden"), MOIST_RATIO), folder)
+    scenario = on_free_ports(_with_moisture(find("garden"), MOIST_RATIO), Folder(folder / "data").place(), FIRST_SHIFT)
     file = folder / "moist.toml"
     file.write_text(toml.dump(scenario))
     garden = "import sys; from console.cli import main; sys.exit(main())"
@@ -169,14 +168,6 @@ def _up(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], Scenario]]:
         except subprocess.TimeoutExpired:
             started.kill()
             started.wait()
-
-
-def _on_free_ports(scenario: Scenario, folder: Path) -> Scenario:
-    for shift in SHIFTS:
-        moved = toml.shifted(scenario, shift)
-        if not taken(processes(moved, Folder(folder / "data").place())):
-            return moved
-    raise ConfigError("no free ports for a garden", hint="end other gardens")
 
 
 def _until_resting(started: subprocess.Popen[bytes], scenario: Scenario) -> None:

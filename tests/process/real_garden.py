@@ -15,7 +15,7 @@ import httpx
 
 from console import toml
 from console.folder import Folder
-from console.ports import taken
+from console.ports import on_free_ports
 from console.processes import Process, World, processes
 from console.runner import environment, tail
 from core.scenario import Scenario
@@ -31,22 +31,12 @@ AGREED_S = 0.02
 MARK = "REAL_GARDEN_TEST"
 
 
-def on_free_ports(scenario: Scenario, folder: Folder) -> Scenario:
-    """The scenario moved to where no port is in use."""
-    first = 1000 + os.getpid() % 500 * 20
-    for shift in range(first, first + 20000, 300):
-        moved = toml.shifted(scenario, shift)
-        if not taken(processes(moved, folder.place())):
-            return moved
-    raise RuntimeError("no free ports")
-
-
 class Watched:
     """What can be asked of a garden over HTTP, and waited for."""
 
     def __init__(self, root: Path, scenario: Scenario, speed: float) -> None:
         self.folder = Folder(root)
-        self.scenario = on_free_ports(scenario, self.folder)
+        self.scenario = on_free_ports(scenario, self.folder.place(), 1000 + os.getpid() % 500 * 20)
         self.speed = speed
         root.mkdir(parents=True, exist_ok=True)
         self.folder.scenario_file.write_text(toml.dump(self.scenario))
