@@ -15,7 +15,7 @@ USER = 10001
 _CHECK = ["CMD", "python", "-m", "console.health"]
 _MOUNTED = "/scenario.toml"
 """Where a scenario that is not in the image is seen."""
-_SOCKETS = PurePosixPath("/run/robot")
+SOCKETS = PurePosixPath("/run/robot")
 
 
 def place(scenario: str) -> Place:
@@ -23,7 +23,7 @@ def place(scenario: str) -> Place:
     return Place(
         data=lambda name: PurePosixPath("/data"),
         keys=lambda name: PurePosixPath("/keys"),
-        socket=lambda robot: f"unix://{_SOCKETS}/body.sock",
+        socket=lambda robot: f"unix://{SOCKETS}/body.sock",
         host=lambda name: name,
         bind="0.0.0.0",
         scenario=scenario,
@@ -94,7 +94,7 @@ def _service(process: Process) -> dict[str, Any]:
 def _volumes(process: Process) -> list[str]:
     volumes = [f"data-{process.name}:/data", f"keys-{process.keys}:/keys:ro"]
     if process.kind in ("body", "robot"):
-        volumes.append(f"socket-{process.keys}:{_SOCKETS}")
+        volumes.append(f"socket-{process.keys}:{SOCKETS}")
     if process.kind == "console":
         volumes.append("keys-operator:/data/keys/operator:ro")
     return volumes
