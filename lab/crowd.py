@@ -14,15 +14,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
 
-from core.allocation.bidding import DOCKING_S, UNDOCKING_S, Condition, Stop, insertion, price, work_s
+from core.allocation.bidding import DOCKING_S, UNDOCKING_S, Condition, Stop, insertion, price, ride_s, work_s
 from core.allocation.plant_side import Market
 from core.allocation.plant_state import Effect, Grant, Kill, Rules, Solicit
 from core.allocation.queue import Entry, TaskQueue
 from core.errors import Refused
-from core.robots import gardener
 from core.wire.geometry import Point3, Pose2
 from core.wire.market import Announcement, Award, Bid, PlantCard, Report, TaskKind
-from robot_service.brain import DRIVE_RATIO, OVERTAKEN_FOR_S, TURNING_S
+from robot_service.brain import OVERTAKEN_FOR_S
 
 Point = tuple[float, float]
 Price = Callable[[Announcement, Condition], Bid]
@@ -37,10 +36,9 @@ _RULES = Rules(lease_s=1e6)
 """Nobody falls silent here."""
 
 
-def ride_s(a: Point, b: Point) -> float:
-    """Seconds on the wheels from place to place, as a brain prices them."""
-    way_m = math.dist(a, b)
-    return way_m / gardener.CRUISE_MPS * DRIVE_RATIO + TURNING_S if way_m > 0.0 else 0.0
+def between_s(a: Point, b: Point) -> float:
+    """Seconds on the wheels from place to place, straight on."""
+    return ride_s(math.dist(a, b)) if a != b else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +57,7 @@ class Instance:
     def leg_s(self, before: Point, docked: bool, plant: int) -> float:
         """Undock, ride, dock and work."""
         undocking_s = UNDOCKING_S if docked else 0.0
-        return undocking_s + ride_s(before, self.plants[plant]) + DOCKING_S + work_s(KIND, 0.0)
+        return undocking_s + between_s(before, self.plants[plant]) + DOCKING_S + work_s(KIND, 0.0)
 
     def route_s(self, robot: int, plants: list[int]) -> float:
         """How long a robot is busy with these, in this order."""
@@ -247,7 +245,7 @@ class Crowd:
         def travel(place: str, dock: str) -> float:
             if place == "here" and running is not None and dock == running.plant_id:
                 return max(0.0, worker.arrives_s - DOCKING_S - self.now_s)
-            return ride_s(worker.here if place == "here" else self._at(place), self._at(dock))
+            return between_s(worker.here if place == "here" else self._at(place), self._at(dock))
 
         return Condition(
             robot_id=worker.id,

@@ -7,7 +7,7 @@ import random
 
 import httpx
 
-from core.allocation.bidding import OTHER_WORK_S, Condition, Stop, insertion, price, work_s
+from core.allocation.bidding import OTHER_WORK_S, Condition, Stop, insertion, price, ride_s, work_s
 from core.allocation.epochs import owner_of
 from core.allocation.queue import Entry, TaskQueue
 from core.clock import Clock
@@ -40,12 +40,10 @@ from robot_service.robot import Robot, launch_of
 from robot_service.scheduler import Scheduler
 from robot_service.settings import NEED_EYE, RobotSettings
 
-TURNING_S = 3.0
 STOP_ANSWER_S = 2.0
 STOPPED_BY_CHARS = 200
 OVERTAKEN_FOR_S = 300.0
 """A task that has waited so long is not put back any more."""
-DRIVE_RATIO = 1.15
 """Driven time over length / cruise: corners and braking."""
 
 
@@ -181,7 +179,7 @@ class Brain:
             return self._travels[key]
         start = self.robot.where.pose if here else launch_of(self.robot.dock(place))
         length_m = None if start is None else self.robot.ground.length_m(start, (goal[0], goal[1]))
-        time_s = None if length_m is None else length_m / gardener.CRUISE_MPS * DRIVE_RATIO + TURNING_S
+        time_s = None if length_m is None else ride_s(length_m)
         if not here:
             self._travels = {k: v for k, v in self._travels.items() if k[0] == key[0]} | {key: time_s}
         return time_s

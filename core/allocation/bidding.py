@@ -22,6 +22,8 @@ BATTERY_ENOUGH_RATIO = 0.40
 BATTERY_FULL_RATIO = 0.90
 TANK_RESERVE_ML = 30.0
 REFILL_MLPS = 30.0
+DRIVE_RATIO, TURNING_S = 1.15, 3.0
+"""Paths are driven more slowly than at cruising speed, and begin and end with a turn."""
 DOCKING_S = 12.0
 UNDOCKING_S = 6.0
 ARM_S = 6.0
@@ -160,6 +162,11 @@ def work_s(kind: TaskKind, dose_ml: float, count: int = 1) -> float:
             return OTHER_WORK_S
 
 
+def ride_s(way_m: float) -> float:
+    """Seconds on the wheels along a path."""
+    return way_m / gardener.CRUISE_MPS * DRIVE_RATIO + TURNING_S
+
+
 def charge_s(from_ratio: float, to_ratio: float = BATTERY_ENOUGH_RATIO) -> float:
     """Seconds on a dock until the pack reaches `to_ratio`."""
     return max(0.0, to_ratio - from_ratio) * gardener.PACK_WH * 3600.0 / gardener.CHARGE_W
@@ -190,8 +197,9 @@ def _best(asked: Announcement, me: Condition) -> tuple[Bid, int]:
         return _yes(asked, me, _begun(me)[1]), 0
     for index, stop in enumerate(me.queue):
         if stop.task_id == asked.task_id:
-            return _inserted(asked, replace(me, queue=me.queue[:index]), index), index
-    tried = ((_inserted(asked, me, index), index) for index in _places(asked.priority, me.queue))
+            return _inserted(asked, replace(me, queue=me.queue[:index]), index, None), index
+    alone_s = _alone_s(me)
+    tried = ((_inserted(asked, me, index, alone_s), index) for index in _places(asked.priority, me.queue))
     return min(tried, key=lambda each: (each[0].cost_s is None, each[0].cost_s or 0.0, -each[1]))
 
 
@@ -210,10 +218,16 @@ def _begun(me: Condition) -> tuple[_Walk, Breakdown]:
     return walk, Breakdown(current_s=max(REST_MIN_S, walk.finish(me.current, me.at_work_s) or 0.0))
 
 
-def _inserted(asked: Announcement, me: Condition, index: int) -> Bid:
-    """The bid with the task at this place of the queue: what others need without it, and what it adds."""
+def _alone_s(me: Condition) -> float | None:
+    """Seconds for the queue as it is, but for water fetched on the way; None when something in it cannot be reached."""
+    walk, _ = _begun(me)
+    spent_s = [walk.serve(stop) for stop in me.queue]
+    return None if None in spent_s else sum(filter(None, spent_s)) - walk.refilled_s
+
+
+def _inserted(asked: Announcement, me: Condition, index: int, alone_s: float | None) -> Bid:
+    """The bid with the task at this place of the queue: what others need without it (`alone_s`), and what it adds."""
     walk, cost = _begun(me)
-    plain = replace(walk)
     for stop in me.queue[:index]:
         if (spent_s := walk.serve(stop)) is None:
             return _no(asked, me, f"no way to {stop.dock}, which is earlier in the queue")
@@ -222,13 +236,11 @@ def _inserted(asked: Announcement, me: Condition, index: int) -> Bid:
     if index == len(me.queue) or bid.cost_s is None or bid.breakdown is None:
         return bid
     behind_s = [walk.serve(stop) for stop in me.queue[index:]]
-    alone_s = [plain.serve(stop) for stop in me.queue]
-    if None in behind_s or None in alone_s:
+    if None in behind_s or alone_s is None:
         return _no(asked, me, "no way to what is later in the queue")
     own, all_s = bid.breakdown, bid.cost_s + sum(filter(None, behind_s))
-    queue_s = sum(filter(None, alone_s)) - plain.refilled_s
-    travel_s = all_s - cost.current_s - queue_s - own.work_s - own.charge_s - walk.refilled_s
-    more = {"queue_s": queue_s, "travel_s": travel_s, "refill_s": walk.refilled_s}
+    travel_s = all_s - cost.current_s - alone_s - own.work_s - own.charge_s - walk.refilled_s
+    more = {"queue_s": alone_s, "travel_s": travel_s, "refill_s": walk.refilled_s}
     return _yes(asked, me, own.model_copy(update=more))
 
 

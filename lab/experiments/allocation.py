@@ -17,7 +17,7 @@ from core.allocation.plant_side import Market
 from core.allocation.plant_state import Effect, Grant, Kill, Solicit
 from core.errors import ConfigError
 from core.wire.geometry import Point3, Pose2
-from core.wire.market import Bid, PlantCard
+from core.wire.market import Bid, PlantCard, Report
 from lab.crowd import Crowd, Instance, Price
 from lab.results import Result, held
 
@@ -126,7 +126,8 @@ def fig13() -> list[str]:
     task_id = plant.ask("water", 150.0, "soil", "dry", 0.0).task_id
     told: list[str] = []
     for at_s, first_s in ((0.0, 3.0), (plant.rules.reallocate_s + 1.0, 7.0)):
-        plant.report(task_id, _still(plant, task_id), at_s) if at_s else None
+        if at_s:
+            plant.report(task_id, Report(robot_id="robot-1", epoch=1, state="awarded"), at_s)
         plant.tick(at_s, ("robot-1", "robot-2"))
         for effect in plant.take_effects():
             told += _said(effect)
@@ -136,13 +137,6 @@ def fig13() -> list[str]:
                     plant.bid(task_id, effect.round_number, robot_id, bid, at_s)
         told += [line for effect in plant.take_effects() for line in _said(effect)]
     return told
-
-
-def _still(plant: Market, task_id: str) -> Any:
-    from core.wire.market import Report
-
-    task = plant.task(task_id)
-    return Report(robot_id=task.robot_id, epoch=task.epoch, state="awarded")
 
 
 def _said(effect: Effect) -> list[str]:
