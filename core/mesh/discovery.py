@@ -75,8 +75,10 @@ class Discovery:
     loopback: bool = False
     """This node itself answers on the loopback interface, so others may."""
     _leads: dict[str, _Lead] = field(default_factory=dict)
+    _asking: Mesh = field(init=False)
 
     def __post_init__(self) -> None:
+        self._asking = Mesh(self.transport, None, self.clock)
         self.peers.sources = (*self.peers.sources, *(source.name for source in self.sources))
 
     def loops(self) -> list[Callable[[], Awaitable[None]]]:
@@ -148,8 +150,7 @@ class Discovery:
         """Raises Unauthorised for somebody who is not of the garden, PeerDown when nobody answers."""
         nonce = f"{self.rng.getrandbits(128):032x}"
         stranger = Peer(id="stranger", kind="robot", url=url)
-        asking = Mesh(self.transport, None, self.clock)
-        answer = await asking.exchange(stranger, "GET", f"/introduction?nonce={quote(nonce)}")
+        answer = await self._asking.exchange(stranger, "GET", f"/introduction?nonce={quote(nonce)}")
         if answer.status != 200:
             raise PeerDown(f"{url} introduces nobody ({answer.status})")
         said = read(stranger, answer, Introduction)

@@ -49,19 +49,22 @@ async def go_along(robot: Robot, path: Sequence[Joints], share: float, grip: Gri
             robot.body.want(arm=q, arm_s=duration_s, gripper_m=grip.opening_m, roll_rad=_roll(robot, grip))
             await robot.tick()
         now = q
-    settled_s = robot.clock.now() + SETTLE_S
-    while robot.clock.now() < settled_s:
-        robot.body.want(arm=now, arm_s=0.1, gripper_m=grip.opening_m, roll_rad=_roll(robot, grip))
+    await _hold(robot, now, SETTLE_S, grip.opening_m, _roll(robot, grip))
+
+
+async def _hold(robot: Robot, q: Joints, seconds: float, opening_m: float, roll_rad: float | None = None) -> None:
+    """The arm holds still while the fingers do as told; without a turn they keep theirs."""
+    until_s = robot.clock.now() + seconds
+    while robot.clock.now() < until_s:
+        robot.body.want(arm=q, arm_s=0.1, gripper_m=opening_m, roll_rad=roll_rad)
         await robot.tick()
 
 
 async def turn_fingers(robot: Robot, by_rad: float, grip: Grip) -> None:
     """Turn them by so much, to what `grip` says, while the arm holds still."""
     if by_rad:
-        q, until_s = joints_now(robot), robot.clock.now() + abs(by_rad) / (FAST_SHARE * gardener.ROLL_SERVO.speed_radps_max)
-        while robot.clock.now() < until_s:
-            robot.body.want(arm=q, arm_s=0.1, gripper_m=grip.opening_m, roll_rad=_roll(robot, grip))
-            await robot.tick()
+        seconds = abs(by_rad) / (FAST_SHARE * gardener.ROLL_SERVO.speed_radps_max)
+        await _hold(robot, joints_now(robot), seconds, grip.opening_m, _roll(robot, grip))
 
 
 async def come_before(robot: Robot, way: Approach) -> None:
@@ -80,19 +83,11 @@ async def swing_to(robot: Robot, goal: Joints, grip: Grip) -> None:
 
 async def close_gripper(robot: Robot) -> None:
     """Close until the force sensor feels something firmly, or the fingers meet."""
-    await _fingers(robot, 0.0, CLOSE_S + SETTLE_S)
+    await _hold(robot, joints_now(robot), CLOSE_S + SETTLE_S, 0.0)
 
 
 async def open_gripper(robot: Robot, opening_m: float = gardener.GRIPPER_OPEN_M) -> None:
-    await _fingers(robot, opening_m, RELEASE_S)
-
-
-async def _fingers(robot: Robot, opening_m: float, seconds: float) -> None:
-    """Move the fingers while the arm holds still."""
-    q, until_s = joints_now(robot), robot.clock.now() + seconds
-    while robot.clock.now() < until_s:
-        robot.body.want(arm=q, arm_s=0.1, gripper_m=opening_m)
-        await robot.tick()
+    await _hold(robot, joints_now(robot), RELEASE_S, opening_m)
 
 
 async def to_basket(robot: Robot) -> bool:
