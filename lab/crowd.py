@@ -103,6 +103,7 @@ class Crowd:
     def __init__(self, instance: Instance, rng: Random, bid: Price = price) -> None:
         self._instance, self._rng, self._bid = instance, rng, bid
         self._plants = [self._market(n) for n in range(len(instance.plants))]
+        self._docks = {f"plant-{number}": at for number, at in enumerate(instance.plants)}
         self._workers = {f"robot-{n:03}": Worker(f"robot-{n:03}", at) for n, at in enumerate(instance.starts)}
         self._heap: list[tuple[float, int, Callable[[], None]]] = []
         self._number = itertools.count()
@@ -245,7 +246,7 @@ class Crowd:
         def travel(place: str, dock: str) -> float:
             if place == "here" and running is not None and dock == running.plant_id:
                 return max(0.0, worker.arrives_s - DOCKING_S - self.now_s)
-            return between_s(worker.here if place == "here" else self._at(place), self._at(dock))
+            return between_s(worker.here if place == "here" else self._docks[place], self._docks[dock])
 
         return Condition(
             robot_id=worker.id,
@@ -260,6 +261,3 @@ class Crowd:
     def _stop(self, entry: Entry) -> Stop:
         settled = self.now_s - entry.since_s > OVERTAKEN_FOR_S
         return Stop(dock=entry.plant_id, work_s=work_s(KIND, 0.0), task_id=entry.task_id, settled=settled)
-
-    def _at(self, dock: str) -> Point:
-        return self._instance.plants[int(dock.removeprefix("plant-"))]

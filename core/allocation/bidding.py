@@ -6,8 +6,10 @@ Source: paper 000, section 7 (cost of distance, queue and abilities); charge and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from core.robots import gardener
 from core.wire.market import Announcement, Bid, Breakdown, TaskKind
@@ -93,6 +95,9 @@ class _Walk:
     refilled_s: float = 0.0
     """What of it went into ways to the tap and filling there."""
 
+    def copy(self) -> _Walk:
+        return _Walk(self.me, self.place, self.docked, self.tank_ml, self.battery_ratio, self.refilled_s)
+
     def go(self, dock: str) -> float | None:
         """Drive there and dock; the seconds it takes."""
         if self.docked and self.place == dock:
@@ -104,6 +109,13 @@ class _Walk:
         total_s = undocking_s + travel_s + DOCKING_S
         self.use(total_s, gardener.IDLE_W + gardener.DRIVE_W)
         return total_s
+
+    def hop_s(self, place: str, dock: str) -> float:
+        """Seconds from dock to dock; infinite when there is no way."""
+        if place == dock:
+            return 0.0
+        travel_s = self.me.travel(place, dock)
+        return math.inf if travel_s is None else UNDOCKING_S + travel_s + DOCKING_S
 
     def use(self, seconds: float, watts: float) -> None:
         self.battery_ratio -= seconds * watts / (gardener.PACK_WH * 3600.0)
@@ -179,28 +191,31 @@ def refill_s(tank_ml: float) -> float:
 def price(asked: Announcement, me: Condition) -> Bid:
     """The bid for `asked`: feasible with its breakdown, or cost None and the reason.
 
-    A task that is held already is priced where it stands: seconds until it would be done. Any other goes where it adds
-    least to the queue (cheapest insertion), and its price is when all that is promised would be done with it (min-max).
+    A task that is held already is priced where it stands. Any other goes where it adds least to the queue (cheapest
+    insertion), and its price is when all that is promised would be done with it (min-max).
     """
-    return _best(asked, me)[0]
+    return offer(asked, me)[0]
 
 
 def insertion(asked: Announcement, me: Condition) -> int:
     """Where in the queue `price` saw the task: what stands there, and all behind it, moves back."""
-    return _best(asked, me)[1]
+    return offer(asked, me)[1]
 
 
-def _best(asked: Announcement, me: Condition) -> tuple[Bid, int]:
+def offer(asked: Announcement, me: Condition) -> tuple[Bid, int]:
+    """The bid, and where in the queue it sees the task."""
     if reason := _unable(asked, me):
         return _no(asked, me, reason), len(me.queue)
+    walk, current_s = _begun(me)
     if me.current is not None and me.current.task_id == asked.task_id:
-        return _yes(asked, me, _begun(me)[1]), 0
+        return _bid(asked, me, _Parts(current_s=current_s)), 0
     for index, stop in enumerate(me.queue):
         if stop.task_id == asked.task_id:
-            return _inserted(asked, replace(me, queue=me.queue[:index]), index, None), index
-    alone_s = _alone_s(me)
-    tried = ((_inserted(asked, me, index, alone_s), index) for index in _places(asked.priority, me.queue))
-    return min(tried, key=lambda each: (each[0].cost_s is None, each[0].cost_s or 0.0, -each[1]))
+            return _bid(asked, me, _inserted(asked, _Route(walk, me.queue[:index]), index, current_s)), index
+    route = _Route(walk, me.queue)
+    tried = [(_inserted(asked, route, index, current_s), index) for index in _places(asked.priority, me.queue)]
+    best, at = min(tried, key=lambda each: (*_rank(each[0]), -each[1]))
+    return _bid(asked, me, best), at
 
 
 def _places(priority: int, queue: tuple[Stop, ...]) -> range:
@@ -210,38 +225,95 @@ def _places(priority: int, queue: tuple[Stop, ...]) -> range:
     return range(first, last + 1)
 
 
-def _begun(me: Condition) -> tuple[_Walk, Breakdown]:
-    """The robot of the imagination once it is done with what is running."""
+class _Parts(NamedTuple):
+    """A breakdown in the making [s]."""
+
+    current_s: float = 0.0
+    queue_s: float = 0.0
+    travel_s: float = 0.0
+    work_s: float = 0.0
+    charge_s: float = 0.0
+    refill_s: float = 0.0
+
+
+def _rank(parts: _Parts | str) -> tuple[bool, float]:
+    """Those that can come first, the soonest of them before all."""
+    return (True, 0.0) if isinstance(parts, str) else (False, sum(parts))
+
+
+def _begun(me: Condition) -> tuple[_Walk, float]:
+    """The robot of the imagination once it is done with what is running, and the seconds until then."""
     walk = _Walk(me, me.docked_at or "here", bool(me.docked_at), me.tank_ml or 0.0, me.battery_ratio)
     if me.current is None:
-        return walk, Breakdown()
-    return walk, Breakdown(current_s=max(REST_MIN_S, walk.finish(me.current, me.at_work_s) or 0.0))
+        return walk, 0.0
+    return walk, max(REST_MIN_S, walk.finish(me.current, me.at_work_s) or 0.0)
 
 
-def _alone_s(me: Condition) -> float | None:
-    """Seconds for the queue as it is, but for water fetched on the way; None when something in it cannot be reached."""
-    walk, _ = _begun(me)
-    spent_s = [walk.serve(stop) for stop in me.queue]
-    return None if None in spent_s else sum(filter(None, spent_s)) - walk.refilled_s
+class _Route:
+    """The queue as it is, walked through once: what every place of a further task is reckoned from."""
+
+    def __init__(self, walk: _Walk, queue: tuple[Stop, ...]) -> None:
+        self.queue, self.barred = queue, ""
+        """The first dock of it that cannot be reached."""
+        self._walks, self._spent_s = [walk], [0.0]
+        for stop in queue:
+            walk = walk.copy()
+            if (spent_s := walk.serve(stop)) is None:
+                self.barred = stop.dock
+                break
+            self._walks.append(walk)
+            self._spent_s.append(self._spent_s[-1] + spent_s)
+        self._dry_s, self._doses_ml = [0.0] * (len(queue) + 1), [0.0] * (len(queue) + 1)
+        for i in range(len(queue) - 1, -1, -1):
+            self._look_behind(i)
+
+    def _look_behind(self, i: int) -> None:
+        """Seconds for stop `i` and all behind it from the stop before, while the tank lasts; and what that takes."""
+        stop, before = self.queue[i], self.queue[i - 1].dock if i else ""
+        plain = stop.dock and not stop.charge and not stop.refill
+        self._doses_ml[i] = self._doses_ml[i + 1] + stop.dose_ml if plain else math.inf
+        hop_s = self._walks[0].hop_s(before, stop.dock) if plain and before else 0.0
+        self._dry_s[i] = hop_s + stop.work_s + self._dry_s[i + 1]
+
+    @property
+    def alone_s(self) -> float:
+        """Seconds for the queue as it is, but for water fetched on the way."""
+        return self._spent_s[-1] - self._walks[-1].refilled_s
+
+    def before(self, index: int) -> tuple[_Walk, float]:
+        """The robot when it comes to this stop, and the seconds until then."""
+        return self._walks[index].copy(), self._spent_s[index]
+
+    def behind_s(self, walk: _Walk, index: int) -> float | None:
+        """Seconds for this stop and all behind it, for a robot that comes from a task put in before it."""
+        if (doses_ml := self._doses_ml[index]) == 0.0 or doses_ml + TANK_RESERVE_ML <= walk.tank_ml:
+            first = self.queue[index]
+            total_s = walk.hop_s(walk.place, first.dock) + first.work_s + self._dry_s[index + 1]
+            return None if total_s == math.inf else total_s
+        spent_s = [walk.serve(stop) for stop in self.queue[index:]]
+        return None if None in spent_s else sum(filter(None, spent_s))
 
 
-def _inserted(asked: Announcement, me: Condition, index: int, alone_s: float | None) -> Bid:
-    """The bid with the task at this place of the queue: what others need without it (`alone_s`), and what it adds."""
-    walk, cost = _begun(me)
-    for stop in me.queue[:index]:
-        if (spent_s := walk.serve(stop)) is None:
-            return _no(asked, me, f"no way to {stop.dock}, which is earlier in the queue")
-        cost = cost.model_copy(update={"queue_s": cost.queue_s + spent_s})
-    bid = _finish(asked, me, walk, cost)
-    if index == len(me.queue) or bid.cost_s is None or bid.breakdown is None:
-        return bid
-    behind_s = [walk.serve(stop) for stop in me.queue[index:]]
-    if None in behind_s or alone_s is None:
-        return _no(asked, me, "no way to what is later in the queue")
-    own, all_s = bid.breakdown, bid.cost_s + sum(filter(None, behind_s))
-    travel_s = all_s - cost.current_s - alone_s - own.work_s - own.charge_s - walk.refilled_s
-    more = {"queue_s": alone_s, "travel_s": travel_s, "refill_s": walk.refilled_s}
-    return _yes(asked, me, own.model_copy(update=more))
+def _inserted(asked: Announcement, route: _Route, index: int, current_s: float) -> _Parts | str:
+    """The bid's parts with the task at this place of the queue, or why not.
+
+    In the middle it is what the others need without it, and what it adds.
+    """
+    if route.barred:
+        return f"no way to {route.barred}, which is in the queue"
+    walk, queue_s = route.before(index)
+    own = _own(asked, walk)
+    if isinstance(own, str):
+        return own
+    if index == len(route.queue):
+        return own._replace(current_s=current_s, queue_s=queue_s)
+    if (behind_s := route.behind_s(walk, index)) is None:
+        return "no way to what is later in the queue"
+    fixed_s = own.work_s + own.charge_s + walk.refilled_s
+    travel_s = queue_s + sum(own) + behind_s - route.alone_s - fixed_s
+    # Its way to tap or charger may save the others some of theirs.
+    alone_s = route.alone_s + min(0.0, travel_s)
+    return _Parts(current_s, alone_s, max(0.0, travel_s), own.work_s, own.charge_s, walk.refilled_s)
 
 
 def _unable(asked: Announcement, me: Condition) -> str:
@@ -263,23 +335,23 @@ def _unable(asked: Announcement, me: Condition) -> str:
     return ""
 
 
-def _finish(asked: Announcement, me: Condition, walk: _Walk, cost: Breakdown) -> Bid:
-    """Add refill and charge where needed, then the way and the work."""
+def _own(asked: Announcement, walk: _Walk) -> _Parts | str:
+    """What the task itself takes: refill and charge where needed, then the way and the work; or why it cannot be."""
     if (water_s := walk.drink(asked.dose_ml)) is None:
-        return _no(asked, me, f"the tank holds {walk.tank_ml:.0f} ml and no tap can be reached")
-    cost = cost.model_copy(update={"refill_s": water_s})
+        return f"the tank holds {walk.tank_ml:.0f} ml and no tap can be reached"
+    charging_s = 0.0
     if walk.battery_ratio < BATTERY_FORCED_RATIO:
-        charger = walk.nearest(me.chargers)
+        charger = walk.nearest(walk.me.chargers)
         way_s = walk.go(charger) if charger else None
         if way_s is None:
-            return _no(asked, me, f"battery at {walk.battery_ratio:.0%} and no charging dock can be reached")
-        cost = cost.model_copy(update={"charge_s": way_s + charge_s(walk.battery_ratio)})
+            return f"battery at {walk.battery_ratio:.0%} and no charging dock can be reached"
+        charging_s = way_s + charge_s(walk.battery_ratio)
     travel_s = walk.go(asked.plant.plant_id)
     if travel_s is None:
-        return _no(asked, me, f"no way to the dock of {asked.plant.plant_id}")
+        return f"no way to the dock of {asked.plant.plant_id}"
     walk.tank_ml -= asked.dose_ml
     work = work_s(asked.kind, asked.dose_ml, asked.count)
-    return _yes(asked, me, cost.model_copy(update={"travel_s": travel_s, "work_s": work}))
+    return _Parts(travel_s=travel_s, work_s=work, charge_s=charging_s, refill_s=water_s)
 
 
 def total_s(cost: Breakdown) -> float:
@@ -287,14 +359,12 @@ def total_s(cost: Breakdown) -> float:
     return cost.current_s + cost.queue_s + cost.travel_s + cost.work_s + cost.charge_s + cost.refill_s
 
 
-def _yes(asked: Announcement, me: Condition, cost: Breakdown) -> Bid:
+def _bid(asked: Announcement, me: Condition, parts: _Parts | str) -> Bid:
+    if isinstance(parts, str):
+        return _no(asked, me, parts)
+    cost = Breakdown(**parts._asdict())
     return Bid(task_id=asked.task_id, robot_id=me.robot_id, cost_s=total_s(cost), breakdown=cost)
 
 
 def _no(asked: Announcement, me: Condition, reason: str) -> Bid:
     return Bid(task_id=asked.task_id, robot_id=me.robot_id, cost_s=None, reason=reason)
-
-
-def without(me: Condition, task_id: str) -> Condition:
-    """The same robot had it never been given this task."""
-    return replace(me, queue=tuple(stop for stop in me.queue if stop.task_id != task_id))

@@ -148,6 +148,18 @@ def test_water_promised_to_earlier_tasks_is_not_there_for_later_ones():
     assert price(asked(), replace(ME, tank_ml=200.0)).breakdown.refill_s == 0.0
 
 
+def test_a_way_to_the_tap_that_shortens_the_ways_of_others_is_no_negative_way():
+    dry, wet = Stop(dock="far", work_s=1.0, task_id="far:1"), Stop(dock="spare", work_s=1.0, dose_ml=150.0, task_id="spare:1")
+    thirsty = replace(ME, tank_ml=100.0, queue=(dry, wet))
+    bid = price(asked(plant="tap", task_id="tap:1"), thirsty)
+    assert insertion(asked(plant="tap", task_id="tap:1"), thirsty) == 0
+    assert bid.breakdown.travel_s == 0.0
+    to_the_tap_s = 20.0 + DOCKING_S + refill_s(100.0)
+    others_s = (UNDOCKING_S + 20.0 + DOCKING_S) + (UNDOCKING_S + 10.0 + DOCKING_S) + 2.0
+    assert bid.cost_s == pytest.approx(to_the_tap_s + work_s("water", 150.0) + others_s)
+    assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
+
+
 def test_a_nearly_empty_pack_is_charged_first_and_paid_for():
     bid = price(asked(), replace(ME, battery_ratio=0.12))
     assert bid.breakdown.charge_s >= charge_s(0.12)
