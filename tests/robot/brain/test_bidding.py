@@ -149,7 +149,10 @@ def test_water_promised_to_earlier_tasks_is_not_there_for_later_ones():
 
 
 def test_a_way_to_the_tap_that_shortens_the_ways_of_others_is_no_negative_way():
-    dry, wet = Stop(dock="far", work_s=1.0, task_id="far:1"), Stop(dock="spare", work_s=1.0, dose_ml=150.0, task_id="spare:1")
+    dry, wet = (
+        Stop(dock="far", work_s=1.0, task_id="far:1"),
+        Stop(dock="spare", work_s=1.0, dose_ml=150.0, task_id="spare:1"),
+    )
     thirsty = replace(ME, tank_ml=100.0, queue=(dry, wet))
     bid = price(asked(plant="tap", task_id="tap:1"), thirsty)
     assert insertion(asked(plant="tap", task_id="tap:1"), thirsty) == 0
