@@ -185,8 +185,8 @@ async def _story(line: Line, task_id: str) -> Story:
     return tell(task, own, heard)
 
 
-def water(plant: str, ml: float | None, data: Path, as_json: bool) -> None:
-    request = _request(TaskRequest, kind="water", dose_ml=ml)
+def water(plant: str, ml: float | None, within_s: float | None, priority: int, data: Path, as_json: bool) -> None:
+    request = _request(TaskRequest, kind="water", dose_ml=ml, within_s=within_s, priority=priority)
 
     async def ask(line: Line) -> Task:
         return await line.mesh.call(line.peer(plant, "plant"), "POST", "/tasks", request, expect=Task)
@@ -195,9 +195,9 @@ def water(plant: str, ml: float | None, data: Path, as_json: bool) -> None:
     _show(task, as_json, lambda: f"{task.task_id}: {plant} asks for {task.dose_ml:g} ml; `garden tasks {task.task_id}`")
 
 
-def harvest(count: int, plant: str, wait: bool, data: Path, as_json: bool) -> None:
+def harvest(count: int, plant: str, wait: bool, within_s: float | None, priority: int, data: Path, as_json: bool) -> None:
     """Order ripe fruit and tell how it goes; ends with status 1 unless all of it came."""
-    wish = _request(OrderRequest, count=count, plant_id=plant)
+    wish = _request(OrderRequest, count=count, plant_id=plant, within_s=within_s, priority=priority)
 
     async def ask(line: Line) -> Order:
         pots = [line.peer(plant, "plant")] if plant else line.peers.of_kind("plant")

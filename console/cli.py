@@ -181,17 +181,23 @@ def tasks(
     ask.tasks(task_id, diagram, out, data, as_json)
 
 
+Within = Annotated[float | None, typer.Option(help="Seconds by which a robot must have begun it, else it fails")]
+Priority = Annotated[int, typer.Option(min=0, max=9, help="Higher goes first in a robot's queue")]
+
+
 @app.command()
 def water(
     plant: Annotated[str, typer.Argument(help="Which pot")],
     ml: Annotated[float | None, typer.Option("--ml", help="How much (the pot's own dose if not given)")] = None,
+    within: Within = None,
+    priority: Priority = 5,
     data: Data = DATA,
     as_json: Json = False,
 ) -> None:
     """Ask a pot to have itself watered."""
     from console import ask
 
-    ask.water(plant, ml, data, as_json)
+    ask.water(plant, ml, within, priority, data, as_json)
 
 
 @app.command()
@@ -199,13 +205,15 @@ def harvest(
     count: Annotated[int, typer.Argument(min=1, max=200, help="How many ripe fruit")],
     plant: Annotated[str, typer.Option(help="Only from this pot")] = "",
     wait: Annotated[bool, typer.Option(help="Tell how it goes until it has ended")] = True,
+    within: Within = None,
+    priority: Priority = 5,
     data: Data = DATA,
     as_json: Json = False,
 ) -> None:
     """Order ripe fruit: split over the pots, each finds a robot to pick its part."""
     from console import ask
 
-    ask.harvest(count, plant, wait, data, as_json)
+    ask.harvest(count, plant, wait, within, priority, data, as_json)
 
 
 Robot = Annotated[str, typer.Argument(help="Which robot")]

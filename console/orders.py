@@ -84,7 +84,10 @@ async def place(order_id: str, wish: OrderRequest, pots: Sequence[Peer], mesh: M
     parts = []
     for name, count in sorted(shares.items()):
         try:
-            task = await send(by_id[name], TaskRequest(kind="harvest", count=count, order_id=order_id))
+            asked = TaskRequest(
+                kind="harvest", count=count, order_id=order_id, within_s=wish.within_s, priority=wish.priority
+            )
+            task = await send(by_id[name], asked)
             parts.append(_part(task))
         except GardenError as error:
             parts.append(OrderPart(plant_id=name, count=count, state="failed", reason=str(error)[:500]))

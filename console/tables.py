@@ -100,6 +100,8 @@ def story(told: Story) -> RenderableType:
     task = told.task
     head = Text(f"{task.task_id}: {task.kind} for {task.plant_id}, {task.state}", style="bold")
     lines = [f"asked by {task.asked_by or '?'} at {task.created_s:.1f} s: {task.why}"]
+    if task.deadline_s is not None:
+        lines.append(f"to be begun by {task.deadline_s:.1f} s")
     if task.kind == "water":
         lines.append(f"dose {task.dose_ml:g} ml")
     if task.kind == "harvest":

@@ -8,6 +8,7 @@ from urllib.parse import parse_qs, urlsplit
 from core import soil
 from core.allocation import permits
 from core.allocation.docks import Docks, DocksDocument
+from core.allocation.tasks import gave_up
 from core.clock import Clock
 from core.errors import DriverError, Refused, StorageError, Unavailable, Unprocessable
 from core.soil import Limits, ProbeState, Reading
@@ -160,7 +161,9 @@ class Pot:
         if request.kind != "water":
             return await self.tending.ask(request, by)
         dose = request.dose_ml if request.dose_ml is not None else self.care.machine.settings.dose_ml
-        return await self.place.change(lambda m, now_s: m.ask("water", dose, by, "asked by hand", now_s, request.priority))
+        return await self.place.change(
+            lambda m, now_s: m.ask("water", dose, by, "asked by hand", now_s, request.priority, within_s=request.within_s)
+        )
 
     async def set_care(self, patch: SettingsPatch, by: str) -> Settings:
         settings = await self.care.change(lambda care: care.change(patch))
@@ -248,7 +251,7 @@ class Pot:
         return self._thirsty and able and enough and now_s >= self._ask_again_s()
 
     def _ask_again_s(self) -> float:
-        failed = [t.updated_s for t in self.place.market.tasks() if t.kind == "water" and t.state == "failed"]
+        failed = [t.updated_s for t in self.place.market.tasks() if t.kind == "water" and gave_up(t)]
         return max(failed, default=-THIRST_AGAIN_S) + THIRST_AGAIN_S
 
     async def _ask(self) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from starlette.responses import Response
 
 from core.allocation.picking import may_be_picked
+from core.allocation.tasks import gave_up
 from core.clock import Clock
 from core.errors import Conflict, Refused
 from core.growth.forecast import forecast, uncertainty
@@ -117,7 +118,9 @@ class Tending:
         """A scan, or ripe fruit; raises Conflict or Refused."""
         if request.kind == "inventory":
             return await self._place.change(
-                lambda m, now_s: m.ask("inventory", 0.0, by, "asked by hand", now_s, request.priority)
+                lambda m, now_s: m.ask(
+                    "inventory", 0.0, by, "asked by hand", now_s, request.priority, within_s=request.within_s
+                )
             )
         await self._make_way(by)
         promised = {name for t in self._place.market.open_tasks() if t.kind == "harvest" for name in t.fruit_ids}
@@ -130,7 +133,7 @@ class Tending:
         return await self._place.change(
             lambda m, now_s: m.ask(
                 "harvest", 0.0, by, f"{count} ripe fruit: {why}", now_s, request.priority,
-                fruit_ids=names, count=count, order_id=request.order_id,
+                within_s=request.within_s, fruit_ids=names, count=count, order_id=request.order_id,
             )
         )  # fmt: skip
 
@@ -152,7 +155,7 @@ class Tending:
             await self._ask_own("harvest", f"{len(fruits)} ripe fruit", [fruit.fruit_id for fruit in fruits], len(fruits))
 
     async def _ask_own(self, kind: str, why: str, fruit_ids: Sequence[str], count: int) -> None:
-        failed_s = [t.updated_s for t in self._place.market.tasks() if t.kind == kind and t.state == "failed"]
+        failed_s = [t.updated_s for t in self._place.market.tasks() if t.kind == kind and gave_up(t)]
         if failed_s and self._clock.now() < max(failed_s) + AFTER_FAILURE_S:
             return
         try:

@@ -7,7 +7,8 @@ import random
 
 import httpx
 
-from core.allocation.bidding import OTHER_WORK_S, Condition, Stop, insertion, price, ride_s, work_s
+from core.allocation import deadlines
+from core.allocation.bidding import OTHER_WORK_S, Condition, Stop, ride_s, work_s
 from core.allocation.epochs import owner_of
 from core.allocation.queue import Entry, TaskQueue
 from core.clock import Clock
@@ -44,7 +45,6 @@ STOP_ANSWER_S = 2.0
 STOPPED_BY_CHARS = 200
 OVERTAKEN_FOR_S = 300.0
 """A task that has waited so long is not put back any more."""
-"""Driven time over length / cruise: corners and braking."""
 
 
 class Brain:
@@ -157,7 +157,7 @@ class Brain:
             return self._no(asked, f"{asked.plant.plant_id} is nobody we know")
         if self.settings.map.dock(asked.plant.plant_id) is None:
             return self._no(asked, f"the dock of {asked.plant.plant_id} is not on our map")
-        return price(asked, self.condition())
+        return deadlines.offer(asked, self.condition(), self._promised())
 
     def _no(self, asked: Announcement, reason: str) -> Bid:
         return Bid(task_id=asked.task_id, robot_id=self.settings.id, cost_s=None, reason=reason)
@@ -222,6 +222,15 @@ class Brain:
         dock = "" if charge or refill else self.robot.where.docked_at
         return Stop(dock=dock, work_s=OTHER_WORK_S, task_id=entry.task_id, charge=charge, refill=refill, settled=True)
 
+    def _promised(self) -> list[Announcement]:
+        """What waits and has a deadline, with the seconds left until then."""
+        now_s = self.clock.now()
+        return [
+            asked.model_copy(update={"within_s": max(0.0, entry.since_s + asked.within_s - now_s)})
+            for entry in self.queue.entries
+            if not entry.running and (asked := entry.announcement) is not None and asked.within_s is not None
+        ]
+
     def _at_work_s(self, running: Entry) -> float:
         """How long it has been at what it came for."""
         where, now_s = self.robot.where, self.clock.now()
@@ -237,7 +246,7 @@ class Brain:
             raise Unprocessable(f"{plant_id} is not a plant we know")
         if award.announcement.kind not in self._can():
             raise Unprocessable(f"cannot {award.announcement.kind}")
-        at = insertion(award.announcement, self.condition())
+        at = deadlines.place(award.announcement, self.condition(), self._promised())
         entry = self.queue.award(award, self.clock.now(), at)
         self.robot.note("award", f"{entry.kind} for {plant_id}", task_id=entry.task_id, epoch=entry.epoch)
         self.scheduler.changed()

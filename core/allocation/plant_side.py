@@ -105,6 +105,7 @@ class Market(TaskBook):
         now_s: float,
         priority: int = 5,
         *,
+        within_s: float | None = None,
         fruit_ids: Sequence[str] = (),
         count: int = 0,
         order_id: str = "",
@@ -126,7 +127,7 @@ class Market(TaskBook):
         task = Task(
             task_id=task_id, kind=kind, state="announced", plant_id=self.card.plant_id, created_s=now_s, updated_s=now_s,
             asked_by=by, why=why[:500], dose_ml=dose_ml, priority=priority, fruit_ids=list(fruit_ids), count=count,
-            order_id=order_id,
+            order_id=order_id, deadline_s=None if within_s is None else now_s + within_s,
         )  # fmt: skip
         self._tasks[task_id] = task
         self._live[task_id] = Live(next_ask_s=now_s)
@@ -310,6 +311,12 @@ class Market(TaskBook):
             return
         self._doubt_pick_of(task, now_s)
         super()._silent(self._tasks[task.task_id], live, now_s)
+
+    def _too_late(self, task: Task, now_s: float) -> None:
+        if task.task_id in self._scanned:
+            self._finish(task, "done", "scanned", now_s)
+        else:
+            super()._too_late(task, now_s)
 
     def _details(self, task: Task) -> dict[str, Any]:
         if task.kind == "harvest":

@@ -25,6 +25,8 @@ class TaskBook:
         self._names = Names(card.plant_id, before.boot + 1)
         self._tasks = {task.task_id: task for task in before.tasks}
         self._failures = dict(before.failures)
+        for task in self.open_tasks():
+            self._tasks[task.task_id] = _in_new_time(task, now_s)
         self._live = {task.task_id: Live.revived(task, now_s, self.rules) for task in self.open_tasks()}
         self._rounds = 0
         self._effects: list[Effect] = []
@@ -47,6 +49,13 @@ class TaskBook:
         """The holder's lease has ended."""
         self._kill(task)
         self._release(task, f"{task.robot_id} fell silent for {self.rules.lease_s:g} s", now_s, failed=False)
+
+    def _too_late(self, task: Task, now_s: float) -> None:
+        """Its deadline has come, and nobody has begun it."""
+        self._kill(task)
+        who = f"{task.robot_id} had it in its queue" if task.robot_id else self._live[task.task_id].told
+        why = f"not begun within {(task.deadline_s or now_s) - task.created_s:g} s, its deadline"
+        self._finish(task, "failed", f"{why}: {who}" if who else why, now_s)
 
     def _details(self, task: Task) -> dict[str, Any]:
         """What an announcement tells beside the task itself."""
@@ -106,7 +115,9 @@ class TaskBook:
             if self._task_due_s(task) > now_s:
                 continue
             live = self._live[task.task_id]
-            if live.round is not None and now_s >= live.round.deadline_s:
+            if now_s >= _begin_by_s(task):
+                self._too_late(task, now_s)
+            elif live.round is not None and now_s >= live.round.deadline_s:
                 self._close_round(task, live.round, now_s)
             elif task.state == "announced":
                 self._open_round(task, "award", robots, now_s)
@@ -124,11 +135,14 @@ class TaskBook:
             self._release(task, f"{task.robot_id} kept it {self.rules.run_s_max:.0f} s without acting", now_s, failed=True)
         elif now_s >= live.resend_s:
             live.resend_s = now_s + self.rules.resend_s
-            self._effects.append(self._grant(task, live.cost_s))
+            self._effects.append(self._grant(task, live.cost_s, now_s))
         elif now_s >= live.reallocate_s:
             self._open_round(task, "reallocate", robots, now_s)
 
     def _task_due_s(self, task: Task) -> float:
+        return min(self._next_s(task), _begin_by_s(task))
+
+    def _next_s(self, task: Task) -> float:
         live = self._live[task.task_id]
         if live.round is not None:
             return min(live.round.deadline_s, math.inf if task.state == "announced" else live.lease_until_s)
@@ -153,7 +167,7 @@ class TaskBook:
         if not robots:
             self._close_round(task, live.round, now_s)
             return
-        self._effects.append(Solicit(self._announcement(task), self._rounds, tuple(sorted(robots))))
+        self._effects.append(Solicit(self._announcement(task, now_s), self._rounds, tuple(sorted(robots))))
 
     def _close_round(self, task: Task, closed: Round, now_s: float) -> None:
         live = self._live[task.task_id]
@@ -206,16 +220,17 @@ class TaskBook:
         live.running_since_s = math.inf
         live.cost_s = cost_s
         self._event(task, f"awarded to {robot_id}, epoch {task.epoch}: {why}", now_s)
-        self._effects.append(self._grant(task, cost_s))
+        self._effects.append(self._grant(task, cost_s, now_s))
 
-    def _grant(self, task: Task, cost_s: float) -> Grant:
-        award = Award(announcement=self._announcement(task), epoch=task.epoch, lease_s=self.rules.lease_s, cost_s=cost_s)
-        return Grant(task.robot_id, award)
+    def _grant(self, task: Task, cost_s: float, now_s: float) -> Grant:
+        asked = self._announcement(task, now_s)
+        return Grant(task.robot_id, Award(announcement=asked, epoch=task.epoch, lease_s=self.rules.lease_s, cost_s=cost_s))
 
-    def _announcement(self, task: Task) -> Announcement:
+    def _announcement(self, task: Task, now_s: float) -> Announcement:
+        within_s = None if task.deadline_s is None else max(0.0, task.deadline_s - now_s)
         return Announcement(
             task_id=task.task_id, kind=task.kind, plant=self.card, dose_ml=task.dose_ml, priority=task.priority,
-            holder=task.robot_id, **self._details(task),
+            holder=task.robot_id, within_s=within_s, **self._details(task),
         )  # fmt: skip
 
     # Ends
@@ -267,3 +282,22 @@ class TaskBook:
         entry = TaskEvent(t_s=now_s, what=what[:500], robot_id=task.robot_id, epoch=task.epoch)
         self._put(task, now_s, events=[*task.events, entry][-self.rules.events_kept :])
         self._effects.append(Note(task.state, what[:500], task.task_id, task.robot_id))
+
+
+def gave_up(task: Task) -> bool:
+    """It failed at its own work; one that merely missed its deadline says nothing against asking again."""
+    missed = task.deadline_s is not None and task.permits == 0 and task.updated_s >= task.deadline_s
+    return task.state == "failed" and not missed
+
+
+def _begin_by_s(task: Task) -> float:
+    """Its deadline while nobody has begun it, else infinite: what has begun is finished."""
+    waits = task.state in ("announced", "awarded")
+    return task.deadline_s if waits and task.deadline_s is not None else math.inf
+
+
+def _in_new_time(task: Task, now_s: float) -> Task:
+    """A task of before the restart. When the clock began anew, its deadline is as far away as when it was asked for."""
+    if task.deadline_s is None or task.created_s <= now_s:
+        return task
+    return task.model_copy(update={"created_s": now_s, "deadline_s": now_s + task.deadline_s - task.created_s})

@@ -16,6 +16,8 @@ FINAL_STATES = ("done", "failed", "cancelled")
 Epoch = Annotated[int, Field(ge=0, le=2**53)]
 OrderId = Annotated[str, Field(max_length=80)]
 """Whose order a harvest belongs to; empty: the plant's own wish."""
+Within = Annotated[float, Field(gt=0, le=1e7)]
+"""A deadline as people give it [s]."""
 ANNOUNCED_FRUITS_MAX = 64
 PICKS_MAX = 64
 
@@ -54,6 +56,8 @@ class Announcement(Document):
     count: Annotated[int, Field(ge=0, le=ANNOUNCED_FRUITS_MAX)] = 0
     """`harvest`: how many of them are wanted; the rest are there to choose from."""
     order_id: OrderId = ""
+    within_s: Seconds | None = None
+    """From now to its deadline; null: it has none."""
 
 
 class Breakdown(Document):
@@ -164,6 +168,8 @@ class Task(Document):
     """`soil`, or the subject of the token that asked."""
     why: Sentence = ""
     priority: Annotated[int, Field(ge=0, le=9)] = 5
+    deadline_s: float | None = None
+    """When it fails unless a robot has begun it."""
     dose_ml: Millilitres = 0.0
     delivered_ml: Millilitres | None = None
     phase: Sentence = ""
@@ -195,6 +201,8 @@ class TaskRequest(Document):
     order_id: OrderId = ""
     """`harvest` only."""
     priority: Annotated[int, Field(ge=0, le=9)] = 5
+    within_s: Within | None = None
+    """It fails unless a robot has begun it within this time; whatever cannot be done by then is not begun."""
 
     @model_validator(mode="after")
     def _fits_its_kind(self) -> TaskRequest:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from core.wire.documents import Document, Identifier, Sentence
+from core.wire.market import Within
 
 OrderState = Literal["running", "done", "partial", "failed", "cancelled"]
 
@@ -17,6 +18,9 @@ class OrderRequest(Document):
     count: Annotated[int, Field(ge=1, le=200)]
     plant_id: Annotated[str, Field(max_length=80)] = ""
     """Only from this plant; any if empty."""
+    within_s: Within | None = None
+    """The deadline of every part."""
+    priority: Annotated[int, Field(ge=0, le=9)] = 5
 
 
 class OrderPart(Document):

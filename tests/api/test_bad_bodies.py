@@ -20,7 +20,7 @@ CARD = {
 }
 ANNOUNCED = {
     "task_id": "plant-1:9:9", "kind": "water", "plant": CARD, "dose_ml": 50.0, "priority": 3, "holder": "robot-1",
-    "fruits": [], "count": 0, "order_id": "",
+    "fruits": [], "count": 0, "order_id": "", "within_s": 60.0,
 }  # fmt: skip
 FRUIT = {
     "colour": "red", "confidence": 0.8, "x_m": 0.1, "y_m": 0.0, "z_m": 0.3, "radius_m": 0.014, "robot_pose": POSE,
@@ -46,7 +46,9 @@ REPORT = {
     "robot_id": "robot-1", "epoch": 1, "state": "running", "phase": "drive", "progress": 0.5, "reason": "",
     "delivered_ml": 1.0, "picks": [PICK],
 }  # fmt: skip
-TASK = {"kind": "water", "dose_ml": 40.0, "count": None, "fruit_ids": [], "order_id": "", "priority": 5}
+TASK = {
+    "kind": "water", "dose_ml": 40.0, "count": None, "fruit_ids": [], "order_id": "", "priority": 5, "within_s": 60.0,
+}  # fmt: skip
 RESERVE = {"robot_id": "robot-1", "dock_id": "", "for_s": 3.0, "yielding": True}
 GOOD: dict[tuple[str, str, str], dict[str, Any]] = {
     ("plant", "PATCH", "/settings"): {
@@ -70,7 +72,7 @@ GOOD: dict[tuple[str, str, str], dict[str, Any]] = {
     ("sim", "PATCH", "/clock"): {"speed": 3.0, "paused": False},
     ("sim", "POST", "/faults"): {"kind": "wheel_slip", "target": "robot-1", "duration_s": 1.0, "strength": 2.0},
     ("console", "POST", "/api/stop"): {"reason": "a test"},
-    ("console", "POST", "/orders"): {"count": 3, "plant_id": ""},
+    ("console", "POST", "/orders"): {"count": 3, "plant_id": "", "within_s": 60.0, "priority": 5},
     ("console", "POST", "/api/plants/{plant_id}/water"): TASK,
 }  # fmt: skip
 """A body that each endpoint takes, with every field it knows: the bad ones are this one, changed in one place."""

@@ -75,7 +75,9 @@ def pot(name: str, verifier: Verifier) -> FastAPI:
 
     @app.post("/tasks", status_code=201)
     async def water(request: TaskRequest = body(TaskRequest), caller: Caller = allow("operator")) -> Task:
-        return TASK.model_copy(update={"asked_by": caller.subject, "dose_ml": request.dose_ml or 150.0, "plant_id": name})
+        wanted = {"dose_ml": request.dose_ml or 150.0, "priority": request.priority}
+        deadline_s = None if request.within_s is None else TASK.created_s + request.within_s
+        return TASK.model_copy(update={"asked_by": caller.subject, "plant_id": name, "deadline_s": deadline_s} | wanted)
 
     return app
 
@@ -206,6 +208,9 @@ def test_water_is_asked_for_with_the_operators_token(street: Street, tmp_path: P
     assert (task["plant_id"], task["dose_ml"], task["asked_by"]) == ("plant-3", 80.0, "operator")
     assert "plant-1, plant-2" in refused(tmp_path, "water", "plant-9").hint
     assert "dose_ml" in str(refused(tmp_path, "water", "plant-3", "--ml", "9000"))
+    soon = asked(tmp_path, "water", "plant-2", "--within", "600", "--priority", "9")
+    assert (soon["deadline_s"] - soon["created_s"], soon["priority"]) == (600.0, 9)
+    assert "within_s" in str(refused(tmp_path, "water", "plant-1", "--within", "0"))
 
 
 def test_stop_stops_all_and_resume_needs_the_operator(street: Street, tmp_path: Path) -> None:

@@ -215,3 +215,23 @@ def test_two_pots_share_two_robots(play: Play) -> None:
         assert {first["robot_id"], second["robot_id"]} == {"robot-1", "robot-2"}
 
     play(story)
+
+
+def test_an_operators_deadline_ends_a_task_that_nobody_begins_and_the_pot_goes_on_asking_for_itself(play: Play) -> None:
+    async def story(garden: Garden) -> None:
+        busy = garden.robot("robot-1", None)
+        busy.reason = "done in 80 s, the deadline is in 60 s"
+        garden.pot(ratio=0.23)
+        await garden.clock.sleep(2.0)
+        wish = {"kind": "water", "dose_ml": 50.0, "within_s": 60.0, "priority": 8}
+        made = (await garden.call("plant-1", "POST", "/tasks", json=wish)).json()
+        assert (made["deadline_s"] - made["created_s"], made["priority"]) == (60.0, 8)
+        failed = await garden.until_task("failed")
+        assert 60.0 <= failed["updated_s"] - failed["created_s"] < 60.1
+        assert "the deadline is in 60 s" in failed["reason"]
+        garden.soils["plant-1"].ratio = 0.19
+        busy.cost = lambda _: 5.0
+        done = await garden.until_task("done", within_s=200.0)
+        assert (done["asked_by"], done["deadline_s"]) == ("soil", None)
+
+    play(story)
