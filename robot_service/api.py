@@ -7,11 +7,12 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Query, Response
 from fastapi.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
 
 from core.errors import Unavailable
 from core.history import as_csv
 from core.mesh.auth import ROLES, Caller, Verifier
-from core.mesh.chassis import allow, body, create_app
+from core.mesh.chassis import allow, body, create_app, serve_direct
 from core.mesh.metrics import measure
 from core.wire.documents import HistoryEntry
 from core.wire.market import Announcement, Award, Bid
@@ -78,6 +79,12 @@ def _readings(app: FastAPI, brain: Brain) -> None:
     @app.get("/position", summary="Cheap, for neighbours", tags=["robot"])
     async def position() -> Position:
         return brain.position()
+
+    async def told(scope: Scope, receive: Receive, send: Send) -> None:
+        content = brain.position().model_dump_json()
+        await Response(content, media_type="application/json")(scope, receive, send)
+
+    serve_direct(app, "GET", "/position", told)
 
     @app.get(
         "/history",

@@ -15,7 +15,7 @@ from hw.protocols.vh400 import volts_of
 from lab.soak.life import NodeClock
 from lab.soak.world import Dose, Truth
 
-FIX_EVERY_S = 1.0
+FIX_EVERY_S = 2.0
 NEVER_S = 1e12
 
 
@@ -118,7 +118,7 @@ class KinematicServos(_Device):
 
 
 class KinematicMarkers(_Device):
-    """Ceiling markers seen exactly, once a second."""
+    """Ceiling markers seen exactly, every other second."""
 
     def __init__(self, robot_id: str, truth: Truth, clock: NodeClock, markers: dict[int, Pose]) -> None:
         super().__init__(clock)

@@ -48,6 +48,8 @@ FATAL = {
 """Chance that a process dies at this instant."""
 DISK = ("crash_before_write", "crash_in_write", "crash_after_write", "disk_eio", "disk_enospc", "torn_write", "fsync_error")
 MEND_AFTER_S = 45.0
+WEAK_RATIO = 0.4
+"""A robot with less than this would charge for most of a calm, and its tasks wait for it."""
 
 
 class Died(BaseException):
@@ -129,7 +131,7 @@ class Gremlin:
             pot.probe_silent = False
         for body in self.truth.robots.values():
             body.pump_broken = False
-            self._carry(body.name)
+            self._carry(body.name, below_ratio=WEAK_RATIO)
         for name in self.garden.processes:
             running = self.garden.running.get(name)
             if running is None:
@@ -233,11 +235,11 @@ class Gremlin:
             self.strike("battery_low", body.name)
             body.battery_ratio = self.rng.uniform(0.08, 0.2)
 
-    def _carry(self, robot_id: str) -> None:
-        """A person puts a full pack into a robot that is empty."""
+    def _carry(self, robot_id: str, below_ratio: float = 0.01) -> None:
+        """A person puts a charged pack into a robot that has so little left."""
         body = self.truth.look(robot_id)
-        if body.battery_ratio <= 0.01:
-            body.battery_ratio = 0.6
+        if body.battery_ratio <= below_ratio:
+            body.battery_ratio = 0.8
             self.touch(robot_id)
 
     async def _pump(self) -> None:

@@ -32,6 +32,7 @@ from lab.soak.disk import Platter, SoakDisk
 from lab.soak.hands import SoakHand
 from lab.soak.life import Life, NodeClock
 from lab.soak.net import SoakMesh, SoakTransport
+from lab.soak.routes import routes_read_once
 from lab.soak.world import Dose, Truth
 from plant_service.node import build as build_plant
 from plant_service.pot import Pot
@@ -47,7 +48,8 @@ COARSE = {
     "robot_service.robot": {"TICK_S": 0.2},
     "robot_service.body.body": {"DT_S": 0.2, "LONG_REST_S": 10.0, "LONG_REST_DT_S": 60.0},
     "robot_service.docks": {"REST_FOR_S": 240.0, "RENEW_RESTING_S": 180.0},
-    "robot_service.neighbours": {"IDLE_EVERY_S": 120.0},
+    "robot_service.neighbours": {"MOVING_EVERY_S": 2.0, "NEAR_EVERY_S": 1.0, "STILL_EVERY_S": 15.0, "IDLE_EVERY_S": 120.0},
+    "robot_service.navigator": {"LOOK_S": 1.0},
 }
 """Periods [s] stretched in a soak. Control loops turn five times a second instead of 50 and 25: bodies without physics need
 no more, and the gate's life of a command still holds. What only tells that nothing happens is told more seldom."""
@@ -286,8 +288,8 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def coarse() -> Iterator[None]:
-    """While in it, loops turn at `COARSE`."""
-    with ExitStack() as stack:
+    """While in it, loops turn at `COARSE`, and routes are read once."""
+    with routes_read_once(), ExitStack() as stack:
         for module, periods in COARSE.items():
             for name, seconds in periods.items():
                 stack.enter_context(mock.patch(f"{module}.{name}", seconds))

@@ -318,7 +318,7 @@ class Judge:
             for task in self._changed(plant_id):
                 if task.state not in FINAL_STATES:
                     self._in_time(plant_id, task, self._seen[task.task_id])
-                self._agree(plant_id, task, entries)
+                    self._agree(plant_id, task, entries)
         for robot_id, held in entries.items():
             self._queue(robot_id, held)
 
