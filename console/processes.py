@@ -175,6 +175,7 @@ class _Maker:
             "ROBOT_CAMERA_URL": f"{self._urls['sim']}/cameras/{robot.id}/hand.jpg",
             "ROBOT_DOCKING": robot.docking,
             "ROBOT_HOME": _json(robot.home),
+            "ROBOT_SPREAD_AFTER_S": f"{robot.spread_after_s:g}",
             "ROBOT_MAP": _json(map_of(self._scenario)),
             "ROBOT_STATION": self._scenario.station.id,
             "ROBOT_DATA": self._data(robot.id),

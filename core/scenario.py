@@ -102,6 +102,8 @@ class Robot(_Section):
     docking: Literal["seek-dock", "beam"] = "seek-dock"
     wrist: Literal["plain", "roll"] = "plain"
     """Whether the gripper turns about the hand."""
+    spread_after_s: Annotated[float, Field(ge=0, le=1e6)] = 120.0
+    """Idle for so long it looks for a better place to wait at; 0: never."""
     x_m: Finite
     y_m: Finite
     yaw_deg: Finite = 0.0

@@ -40,6 +40,7 @@ from robot_service.reporter import Reporter
 from robot_service.robot import Robot, launch_of
 from robot_service.scheduler import Scheduler
 from robot_service.settings import NEED_EYE, RobotSettings
+from robot_service.spread import Spread
 
 STOP_ANSWER_S = 2.0
 STOPPED_BY_CHARS = 200
@@ -74,7 +75,8 @@ class Brain:
         self.queue = TaskQueue()
         self.reporter = Reporter(self.robot, self.queue)
         planner = Planner(self.robot, self.docks, self.travel_s, hand or Hand())
-        self.scheduler = Scheduler(self.robot, self.docks, planner, self.queue, self.reporter)
+        spread = Spread(self.robot, self.travel_s)
+        self.scheduler = Scheduler(self.robot, self.docks, planner, self.queue, self.reporter, spread)
         self.reporter.kill = self.scheduler.kill
         self._stopped = True
         self._travels: dict[tuple[int, str, str], float | None] = {}

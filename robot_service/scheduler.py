@@ -16,12 +16,13 @@ from core.allocation.queue import Entry, TaskQueue
 from core.allocation.right_of_way import RANK_IDLE, in_the_way_of
 from core.geometry.planar import distance_m
 from core.wire.market import Report
-from robot_service.docks import Docks
+from robot_service.docks import RENEW_S, Docks
 from robot_service.planner import Planner
 from robot_service.reporter import Reporter
 from robot_service.robot import RANK_BUSY, Halted, Robot, SkillFailed, reason_of, tuple_of
-from robot_service.skills.dock import insist
+from robot_service.skills.dock import dock_at, insist
 from robot_service.skills.drive import drive_to, undock
+from robot_service.spread import EVERY_S, FAILED_S, Spread
 
 IDLE_LOOK_S = 2.0
 HOME_LOOK_S = 10.0
@@ -39,6 +40,7 @@ class Scheduler:
     planner: Planner
     queue: TaskQueue
     reporter: Reporter
+    spread: Spread
     began_s: float = 0.0
     _work: asyncio.Task[Any] | None = None
     _idling: bool = False
@@ -117,6 +119,7 @@ class Scheduler:
 
     async def _execute(self, entry: Entry) -> None:
         entry.running, self.began_s = True, self.robot.clock.now()
+        self.spread.later()
         self.robot.note("task", f"begins {entry.kind} {entry.plant_id}".strip(), task_id=entry.task_id)
         report, cut = await self._worked(self.planner.run(entry))
         self.queue.drop(entry)
@@ -174,6 +177,8 @@ class Scheduler:
         try:
             if self._stopped():
                 await self._dwell()
+            elif not self._sent and (place := await self.spread.place()):
+                await self._wait_at(place)
             elif self.robot.where.docked_at:
                 await self._rest_on_dock(self.robot.where.docked_at)
             else:
@@ -203,6 +208,7 @@ class Scheduler:
             hold = self.docks.holds.get(name)
         if hold is not None and (hold.wanted_by or hold.lost):
             self.robot.note("yield", f"leaves {name} to {hold.wanted_by or 'its owner'}")
+            self.spread.later()
             await undock(self.robot, self.docks)
             await self._go_home()
             return
@@ -210,6 +216,33 @@ class Scheduler:
         await self.robot.clock.sleep(IDLE_LOOK_S)
         if hold is not None and not (hold.wanted_by or hold.lost):
             await self.docks.news(HOME_LOOK_S - IDLE_LOOK_S)
+
+    async def _wait_at(self, name: str) -> None:
+        """Go and rest on another dock, unless its owner or somebody else wants otherwise meanwhile."""
+        dock = self.robot.dock(name)
+        if await self.docks.ask(dock, yielding=True):
+            return
+        self.robot.note("spread", f"goes to wait at {name}, nearer to what may come")
+        self.spread.later(FAILED_S)
+        going = asyncio.ensure_future(dock_at(self.robot, self.docks, name, yielding=True, rank=RANK_IDLE))
+        try:
+            while not going.done() and not self._is_wanted(name):
+                news = asyncio.ensure_future(self.docks.news(RENEW_S))
+                await asyncio.wait({going, news}, return_when=asyncio.FIRST_COMPLETED)
+                news.cancel()
+                if not going.done():
+                    await self.docks.ask(dock, yielding=True)
+            if going.done():
+                going.result()
+                self.spread.later(EVERY_S)
+        finally:
+            going.cancel()
+            await asyncio.gather(going, return_exceptions=True)
+
+    def _is_wanted(self, name: str) -> bool:
+        """The dock that we go to rest on is somebody's to work at."""
+        hold = self.docks.holds.get(name)
+        return hold is None or bool(hold.lost or hold.wanted_by)
 
     async def _stand_by(self) -> None:
         await self.docks.release_others()

@@ -43,6 +43,8 @@ class RobotSettings(BaseSettings):
     map: GardenMap
     capabilities: Annotated[tuple[str, ...], NoDecode] = CAPABILITIES
     """What it is fitted for, separated by commas in the environment."""
+    spread_after_s: Annotated[float, Field(ge=0, le=1e6)] = 120.0
+    """Idle for so long, it looks for a better place to wait at; 0: never, it waits where its last work ended."""
     data: Path | None = None
     """Folder for the boot counter; None keeps nothing."""
 

@@ -8,7 +8,7 @@ from core.geometry.planar import Pose
 from core.planning.docking import BeamDocking, WatchdogRectangle
 from core.robots.garden_map import KnownDock
 from robot_service.docks import Docks
-from robot_service.robot import RANK_BUSY, Robot, SkillFailed, launch_of, tuple_of
+from robot_service.robot import RANK_BUSY, RANK_DRIVING, Robot, SkillFailed, launch_of, tuple_of
 from robot_service.skills.drive import drive_to, undock
 
 TRIES = 4
@@ -17,7 +17,7 @@ ASK_AGAIN_S = 2.0
 WRONG_AFTER_S = 1.0
 
 
-async def dock_at(robot: Robot, docks: Docks, name: str, *, yielding: bool = False) -> None:
+async def dock_at(robot: Robot, docks: Docks, name: str, *, yielding: bool = False, rank: int = RANK_DRIVING) -> None:
     """Stand on dock `name` with charge current flowing. Raises SkillFailed with the last reason after `TRIES`."""
     dock = robot.dock(name)
     if robot.where.docked_at == name:
@@ -31,7 +31,7 @@ async def dock_at(robot: Robot, docks: Docks, name: str, *, yielding: bool = Fal
     for attempt in range(TRIES):
         robot.activity.job = "navigate"
         await gate.ask()
-        await _to_launch(robot, gate)
+        await _to_launch(robot, gate, rank)
         robot.activity.job = "dock"
         why = await _approach(robot, docks, dock)
         if not why:
@@ -71,12 +71,12 @@ class Gate:
         return self.why or f"waits for dock {self.dock.name}"
 
 
-async def _to_launch(robot: Robot, gate: Gate) -> None:
+async def _to_launch(robot: Robot, gate: Gate, rank: int) -> None:
     """Drive to the launch point, asking for the dock meanwhile."""
     async with robot.beside(_asking(robot, gate)):
         launch, dock = launch_of(gate.dock), gate.dock.pose
         zone = ((launch[0], launch[1]), (dock.x_m, dock.y_m))
-        await drive_to(robot, launch, may_enter=gate.closed, zone=zone)
+        await drive_to(robot, launch, rank=rank, may_enter=gate.closed, zone=zone)
 
 
 async def _asking(robot: Robot, gate: Gate) -> None:
