@@ -1,6 +1,7 @@
 """What goes wrong in a soaked garden: drawn by the seed, at random and at the worst instants by name, and mended again.
 
-`Gremlin.touches` counts by node how often a fault met it, and `touched_s` when last: judges allow for that.
+`Gremlin.touches` counts by node how often a fault met it, `touched_s` says when last, and `crossed` counts by what they
+were about the messages that a fault met: judges allow for that.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from core.mesh.client import Answer
 from lab.soak.garden import Hooks, Running, SoakGarden
@@ -44,9 +46,11 @@ WORST = {
 FATAL = {
     "death_after_act": 0.10, "death_before_act": 0.05, "crash_after_permit": 0.05, "crash_after_award": 0.05,
     "crash_on_end": 0.05, "crash_writing_award": 0.06, "crash_writing_permit": 0.10, "pause_under_permit": 0.04,
+    "permit_lost_in_crash": 0.06, "permit_asked_late": 0.06, "power_cycle_while_stopped": 0.3,
 }  # fmt: skip
-"""Chance that a process dies at this instant."""
+"""Chance that a process dies, or sleeps, at this instant."""
 DISK = ("crash_before_write", "crash_in_write", "crash_after_write", "disk_eio", "disk_enospc", "torn_write", "fsync_error")
+LATE_PERMIT_S = (10.0, 60.0)
 MEND_AFTER_S = 45.0
 WEAK_RATIO = 0.4
 """A robot with less than this would charge for most of a calm, and its tasks wait for it."""
@@ -64,6 +68,8 @@ class Gremlin:
         self.garden: SoakGarden
         self.on = False
         self.touches: Counter[str] = Counter()
+        self.crossed: Counter[str] = Counter()
+        """Messages by the task they named, else by whose dock or tap they were about, else nothing: where a robot is."""
         self.touched_s: defaultdict[str, float] = defaultdict(lambda: -math.inf)
         self.stopped_s: dict[str, float] = {}
         """Robots whose e-stop somebody pressed."""
@@ -73,7 +79,6 @@ class Gremlin:
         self._healing: set[asyncio.Task[None]] = set()
         self.halted: Callable[[str], None] = lambda name: None
         """A brain died, or sleeps: its robot must stop."""
-        self.crashed: Callable[[str], None] = lambda name: None
 
     def hooks(self, moved: Callable[[str], None], died: Callable[[str, BaseException], None]) -> Hooks:
         return Hooks(disk=self._at_disk, poured=self._poured, picked=self._picked, moved=moved, died=died, clock=self._clock)
@@ -81,13 +86,18 @@ class Gremlin:
     def attach(self, garden: SoakGarden) -> None:
         self.garden = garden
         garden.mesh.worst = self._worst
-        garden.mesh.touched = lambda kind, source, target, body: self.touch(source, target)
+        garden.mesh.touched, garden.mesh.held_s = self._cross, self._held_s
 
     def touch(self, *names: str) -> None:
         now_s = self.truth.now()
         for name in names:
             self.touches[name] += 1
             self.touched_s[name] = now_s
+
+    def _cross(self, message: Message) -> None:
+        """A fault met a message."""
+        self.crossed[_about(message)] += 1
+        self.touched_s[message.source] = self.touched_s[message.target] = self.truth.now()
 
     def strike(self, kind: str, *names: str) -> None:
         self.counts[kind] += 1
@@ -176,30 +186,29 @@ class Gremlin:
     async def _crash(self) -> None:
         await self.crash(self.rng.choice(self._nodes()))
 
-    async def crash(self, name: str, kind: str = "") -> None:
-        """SIGKILL, or the power of a pot's machine, and a start some time later."""
+    async def crash(self, name: str, kind: str = "", down_s: float = 0.0) -> None:
+        """SIGKILL, or the power of a pot's machine, and a start some time later; `down_s` 0: by chance."""
         if self.garden.running.get(name) is None:
             return
         family = self.garden.processes[name].kind
         self.strike(kind or f"crash_{'brain' if family == 'robot' else 'pot' if family == 'plant' else family}", name)
         self.garden.kill(name)
-        self.crashed(name)
         if family == "robot":
             self.halted(name)
         elif self.rng.random() < 0.5:
             self.counts["power_lost"] += 1
             if self.garden.platters[name].lose_power(self.rng):
                 self.counts["unsynced_writes_lost"] += 1
-        await asyncio.sleep(self.rng.choice(DOWN_S))
+        await asyncio.sleep(down_s or self.rng.choice(DOWN_S))
         self.touch(name)
         if self.garden.running.get(name) is None:
             self.garden.start(name)
 
-    async def _power_cycle(self) -> None:
+    async def _power_cycle(self, robot_id: str = "", kind: str = "crash_robot") -> None:
         """The whole robot goes dark: brain and body."""
-        robot_id = self.rng.choice(self.garden.names("robot"))
+        robot_id = robot_id or self.rng.choice(self.garden.names("robot"))
         body = f"{robot_id}-body"
-        self.strike("crash_robot", robot_id)
+        self.strike(kind, robot_id)
         for name in (robot_id, body):
             self.garden.kill(name)
         await asyncio.sleep(self.rng.choice(DOWN_S))
@@ -208,12 +217,12 @@ class Gremlin:
             if self.garden.running.get(name) is None:
                 self.garden.start(name)
 
-    async def _pause(self, name: str = "") -> None:
+    async def _pause(self, name: str = "", seconds: float = 0.0) -> None:
         name = name or self.rng.choice(self._nodes())
         running = self.garden.running.get(name)
         if running is None or running.life.stopped:
             return
-        seconds = self.rng.choice(PAUSE_S)
+        seconds = seconds or self.rng.choice(PAUSE_S)
         self.strike("pause_beyond_lease" if seconds > LEASE_S else "pause", name)
         running.life.stopped = True
         if running.process.kind == "robot":
@@ -309,7 +318,6 @@ class Gremlin:
     async def _buried(self, name: str) -> None:
         """What is left of a process that died within a write is taken away, and it starts again later."""
         self.garden.kill(name)
-        self.crashed(name)
         robot_id = self.garden.processes[name].keys
         if self.garden.processes[name].kind == "body":
             self.garden.kill(robot_id)
@@ -324,7 +332,6 @@ class Gremlin:
         await asyncio.sleep(MEND_AFTER_S)
         self.touch(name, self.garden.processes[name].keys)
         self.garden.kill(name)
-        self.crashed(name)
         self.garden.start(name)
 
     # At the worst instants
@@ -333,28 +340,53 @@ class Gremlin:
         if not self.on:
             return False
         kind = _named(message, answer)
-        self._at_the_worst(message, answer)
-        if kind in WORST and self.rng.random() < WORST[kind]:
-            self.strike(kind, message.source, message.target)
+        self._at_the_worst(message, answer, kind)
+        if kind in WORST and self._chance(WORST[kind]):
+            self.counts[kind] += 1
+            self._cross(message)
             return True
-        fatal = {"permit_reply_lost": "crash_after_permit", "award_reply_lost": "crash_after_award"}.get(kind, "")
-        if fatal and self.rng.random() < FATAL[fatal]:
-            self._later(self.crash(message.target if fatal == "crash_after_permit" else message.source, fatal))
-        if kind == "permit_reply_lost" and self.rng.random() < FATAL["death_before_act"]:
-            self._later(self.crash(message.source, "death_before_act"))
-        if kind == "end_report_lost" and self.rng.random() < FATAL["crash_on_end"]:
-            self._later(self.crash(message.target, "crash_on_end"))
+        if kind == "permit_reply_lost" and self._chance(FATAL["permit_lost_in_crash"]):
+            self._later(self.crash(message.target, "permit_lost_in_crash", DOWN_S[0]))
+            return True
         return False
 
-    def _at_the_worst(self, message: Message, answer: Answer | None) -> None:
-        """A pot dies while it writes an award or a permit; a brain sleeps with a fresh permit."""
-        if message.path == "/bids" and answer is not None and self.rng.random() < FATAL["crash_writing_award"]:
+    def _at_the_worst(self, message: Message, answer: Answer | None, kind: str) -> None:
+        """A pot dies as it awards, permits or hears of an end, or while it writes that; a robot as it may act."""
+        if message.path == "/bids" and answer is not None and self._chance(FATAL["crash_writing_award"]):
             self._arm("crash_writing_award", message.source)
-        if message.path.endswith("/permits") and answer is None and self.rng.random() < FATAL["crash_writing_permit"]:
+        if message.path.endswith("/permits") and answer is None and self._chance(FATAL["crash_writing_permit"]):
             self._arm("crash_writing_permit", message.target)
-        if message.path.endswith("/permits") and answer is not None and self.rng.random() < FATAL["pause_under_permit"]:
+        if kind == "permit_reply_lost":
+            self._at_a_permit(message.source, message.target)
+        if kind == "award_reply_lost" and self._chance(FATAL["crash_after_award"]):
+            self._later(self.crash(message.source, "crash_after_award"))
+        if kind == "end_report_lost" and self._chance(FATAL["crash_on_end"]):
+            self._later(self.crash(message.target, "crash_on_end"))
+        if message.path == "/stop" and answer is not None and self._chance(FATAL["power_cycle_while_stopped"]):
+            self._later(self._power_cycle(message.target, "power_cycle_while_stopped"))
+
+    def _at_a_permit(self, robot_id: str, plant_id: str) -> None:
+        """A permit is about to leave its pot."""
+        if self._chance(FATAL["crash_after_permit"]):
+            self._later(self.crash(plant_id, "crash_after_permit"))
+        if self._chance(FATAL["death_before_act"]):
+            self._later(self.crash(robot_id, "death_before_act"))
+        if self._chance(FATAL["pause_under_permit"]):
             self.counts["pause_under_permit"] += 1
-            self._later(self._pause(message.source))
+            self._later(self._pause(robot_id))
+
+    def _held_s(self, message: Message) -> float:
+        """A robot falls asleep as it asks for a permit, and the question comes when its lease has long ended."""
+        asks = self.on and message.method == "POST" and message.path.endswith("/permits")
+        if not asks or not self._chance(FATAL["permit_asked_late"]):
+            return 0.0
+        self.counts["permit_asked_late"] += 1
+        self._cross(message)
+        self._later(self._pause(message.source, self.rng.choice(PAUSE_S[2:])))
+        return self.rng.uniform(*LATE_PERMIT_S)
+
+    def _chance(self, share: float) -> bool:
+        return self.rng.random() < share
 
     def _arm(self, why: str, name: str) -> None:
         """Whatever this pot writes next is the last that it does."""
@@ -362,16 +394,26 @@ class Gremlin:
         self._disk[name] = self.rng.choice(("crash_before_write", "crash_in_write", "crash_after_write"))
 
     def _poured(self, dose: Dose) -> None:
-        if self.on and dose.ml > 1.0 and self.rng.random() < FATAL["death_after_act"]:
+        if self.on and dose.ml > 1.0 and self._chance(FATAL["death_after_act"]):
             self._later(self.crash(dose.robot_id, "death_after_act"))
 
     def _picked(self, robot_id: str, permit_id: str) -> None:
-        if self.on and self.rng.random() < FATAL["death_after_act"]:
+        if self.on and self._chance(FATAL["death_after_act"]):
             self._later(self.crash(robot_id, "death_after_act"))
 
     def _clock(self, name: str) -> NodeClock:
         self.counts["clock_skew"] += 1
         return skewed(self.rng)
+
+
+def _about(message: Message) -> str:
+    """What this message is about, as `Gremlin.crossed` counts it."""
+    if message.path.startswith("/tasks/"):
+        return unquote(message.path.partition("?")[0].split("/")[2])
+    if message.path in ("/bids", "/tasks") and message.target.startswith("robot"):
+        asked = json.loads(message.body)
+        return str(asked.get("announcement", asked)["task_id"])
+    return message.target if message.path.startswith(("/dock", "/tap")) else ""
 
 
 def _named(message: Message, answer: Answer | None) -> str:

@@ -32,7 +32,7 @@ from lab.soak.disk import Platter, SoakDisk
 from lab.soak.hands import SoakHand
 from lab.soak.life import Life, NodeClock
 from lab.soak.net import SoakMesh, SoakTransport
-from lab.soak.routes import routes_read_once
+from lab.soak.routes import forget_the_dead, routes_read_once
 from lab.soak.world import Dose, Truth
 from plant_service.node import build as build_plant
 from plant_service.pot import Pot
@@ -147,6 +147,7 @@ class SoakGarden:
     def start(self, name: str) -> None:
         """Start a process on what its disk holds. A service that refuses to start is reported as dead."""
         process = self.processes[name]
+        forget_the_dead()
         self._boots[name] += 1
         life = Life(name, self.hooks.clock(name))
         platter = self.platters.setdefault(name, Platter())
@@ -182,12 +183,15 @@ class SoakGarden:
             self.hooks.died(name, error)
 
     async def _live(self, running: Running) -> None:
-        if (before := self._dying.pop(running.process.name, None)) is not None:
-            # The system takes a dead process's locks away at once; here its last tasks must have ended.
-            await asyncio.wait([before])
+        await self._buried(running.process.name)
         async with asyncio.TaskGroup() as group:
             for loop in self._build(running):
                 group.create_task(_run(loop))
+
+    async def _buried(self, name: str) -> None:
+        """The system takes a dead process's locks away at once; here its last tasks must have ended."""
+        if (before := self._dying.pop(name, None)) is not None:
+            await asyncio.wait([before])
 
     # Building
 

@@ -68,7 +68,7 @@ class SoakMesh:
         self.weather = CLEAR
         self.cut: set[tuple[str, str]] = set()
         self.requests = 0
-        self.touched: Callable[[str, str, str, bytes], None] = lambda kind, source, target, body: None
+        self.touched: Callable[[Message], None] = lambda message: None
         """A fault met a message."""
         self.arrived: Callable[[Message], None] = lambda message: None
         self.answered: Callable[[Message, Answer], None] = lambda message, answer: None
@@ -77,6 +77,8 @@ class SoakMesh:
         """The answer has come to who asked."""
         self.worst: Callable[[Message, Answer | None], bool] = lambda message, answer: False
         """Asked of every request, and of every answer: whether just this one is lost."""
+        self.held_s: Callable[[Message], float] = lambda message: 0.0
+        """Asked of every request: how long just this one is kept on its way."""
 
     def attach(self, name: str, netloc: str, life: Life, app: Asgi) -> None:
         self._hosts[netloc] = Host(life, app)
@@ -97,34 +99,35 @@ class SoakMesh:
         done: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         if self.worst(message, None):
             return await done
-        for delay_s in self._fates("request_lost", life.name, target, body):
-            asyncio.get_running_loop().call_later(delay_s, self._deliver, message, parts.netloc, headers, done)
+        held_s = self.held_s(message)
+        for delay_s in self._fates("request_lost", life.name, target, message):
+            asyncio.get_running_loop().call_later(held_s + delay_s, self._deliver, message, parts.netloc, headers, done)
         return await done
 
-    def _fates(self, lost: str, source: str, target: str, body: bytes) -> list[float]:
+    def _fates(self, lost: str, source: str, target: str, message: Message) -> list[float]:
         """When copies of a message arrive; none when it is lost."""
         rng, weather = self._rng, self.weather
         if (source, target) in self.cut:
-            self.touched("link_cut", source, target, body)
+            self.touched(message)
             return []
         delay_s = rng.uniform(*LATENCY_S)
         if weather is CLEAR:
             return [delay_s]
         if rng.random() < getattr(weather, lost):
-            return self._struck(lost, source, target, body, [])
+            return self._struck(lost, message, [])
         if rng.random() < weather.late:
-            return self._struck("late", source, target, body, [rng.uniform(*LATE_S)])
+            return self._struck("late", message, [rng.uniform(*LATE_S)])
         if rng.random() < weather.reordered:
             delay_s += rng.uniform(0.0, JITTER_S)
-            self._struck("reordered", source, target, body, [])
+            self._struck("reordered", message, [])
         if lost == "request_lost" and rng.random() < weather.duplicated:
             again_s = delay_s + (rng.uniform(*LATE_S) if rng.random() < 0.3 else rng.uniform(0.0, 0.1))
-            return self._struck("duplicated", source, target, body, [delay_s, again_s])
+            return self._struck("duplicated", message, [delay_s, again_s])
         return [delay_s]
 
-    def _struck(self, kind: str, source: str, target: str, body: bytes, fates: list[float]) -> list[float]:
+    def _struck(self, kind: str, message: Message, fates: list[float]) -> list[float]:
         self._faults[kind] += 1
-        self.touched(kind, source, target, body)
+        self.touched(message)
         return fates
 
     def _deliver(self, message: Message, netloc: str, headers: Mapping[str, str], done: asyncio.Future[Answer]) -> None:
@@ -147,7 +150,7 @@ class SoakMesh:
         self.answered(message, answer)
         if self.worst(message, answer) or not host.life.alive:
             return
-        for delay_s in self._fates("reply_lost", message.target, message.source, message.body):
+        for delay_s in self._fates("reply_lost", message.target, message.source, message):
             asyncio.get_running_loop().call_later(delay_s, self._bring, message, answer, done)
 
     def _bring(self, message: Message, answer: Answer, done: asyncio.Future[Answer]) -> None:

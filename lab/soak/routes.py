@@ -14,7 +14,7 @@ from types import CodeType
 from typing import Any
 from unittest import mock
 
-from fastapi.dependencies.models import Dependant
+from fastapi.dependencies import models
 from fastapi.routing import APIRoute, request_response
 
 _Key = tuple[str, CodeType, frozenset[str]]
@@ -45,8 +45,15 @@ def _without_its_service(route: APIRoute) -> APIRoute:
     """What was read, holding on to nothing of the service it was read in."""
     kept = copy(route)
     kept.endpoint, kept.app, kept.dependency_overrides_provider = _nobody, _nobody, None
-    kept.dependant = replace(route.dependant, call=_nobody) if isinstance(route.dependant, Dependant) else route.dependant
+    kept.dependant = replace(route.dependant, call=_nobody)
     return kept
+
+
+def forget_the_dead() -> None:
+    """FastAPI remembers of some thousand endpoints what they are, and with each all that it closes over."""
+    for remembered in vars(models).values():
+        if hasattr(remembered, "cache_clear"):
+            remembered.cache_clear()
 
 
 async def _nobody(*_: Any) -> None:

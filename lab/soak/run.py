@@ -19,10 +19,12 @@ from core.mesh.client import Answer
 from core.robots.garden_map import map_of
 from core.scenario import Scenario, find
 from lab.quiet import hush
+from lab.soak.case import Breach, Tally
 from lab.soak.faults import CALM_EVERY_S, Gremlin
 from lab.soak.garden import SoakGarden, _identity, coarse
-from lab.soak.judge import Breach, Judge, Tally
+from lab.soak.judge import Judge
 from lab.soak.life import Life, SoakLoop
+from lab.soak.routes import forget_the_dead
 from lab.soak.world import Dose, Truth
 
 DAY_S = 86400.0
@@ -68,14 +70,13 @@ def soak(plan: Plan, told: Callable[[float], None] = lambda share: None) -> Outc
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     logging.getLogger("core.store").setLevel(logging.CRITICAL)
     base = MEMORY if MEMORY.is_dir() else None
-    was_on = gc.isenabled()
     with tempfile.TemporaryDirectory(dir=base) as folder, coarse(), warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)
         with asyncio.Runner(loop_factory=SoakLoop) as runner:
             runner.get_loop().set_exception_handler(lambda loop, context: None)
             outcome = runner.run(_soak(plan, Path(folder), told))
-    if was_on:
-        gc.collect()
+    forget_the_dead()
+    gc.collect()
     return outcome
 
 
@@ -95,18 +96,18 @@ async def _soak(plan: Plan, folder: Path, told: Callable[[float], None]) -> Outc
     truth = Truth(scenario, map_of(scenario), random.Random(rng.random()), rng.uniform(0.1, 0.5), rng.uniform(0.2, 1.0))
     gremlin = Gremlin(random.Random(rng.random()), truth, counts)
     judge = Judge(truth, gremlin)
-    hooks = gremlin.hooks(judge.moved, lambda name, error: _refused(judge, gremlin, name, error))
+    hooks = gremlin.hooks(judge.acts.moved, lambda name, error: _refused(judge, gremlin, name, error))
     poured, picked = hooks.poured, hooks.picked
 
     def ended(dose: Dose) -> None:
-        judge._ended(dose)
+        judge.acts.ended(dose)
         poured(dose)
 
     def closed(robot_id: str, permit_id: str) -> None:
-        judge.picked(robot_id, permit_id)
+        judge.acts.picked(robot_id, permit_id)
         picked(robot_id, permit_id)
 
-    hooks.poured, hooks.picked, truth.began = ended, closed, judge._began
+    hooks.poured, hooks.picked = ended, closed
     garden = SoakGarden(scenario, plan.seed, folder, truth, hooks, counts)
     gremlin.attach(garden)
     judge.attach(garden)
@@ -129,7 +130,7 @@ async def _soak(plan: Plan, folder: Path, told: Callable[[float], None]) -> Outc
         await people.mend()
         await asyncio.sleep(END_CALM_S)
         judge.look()
-        judge.drained()
+        judge.progress.drained()
     jobs[0].cancel()
     judge.tally.doses, judge.tally.picks, judge.tally.requests = len(truth.doses), truth.picks, garden.mesh.requests
     for name in list(garden.running):
@@ -158,7 +159,7 @@ async def _calms(judge: Judge) -> None:
     """At the end of every calm nothing may be left over."""
     while True:
         await asyncio.sleep(CALM_EVERY_S - 30.0)
-        judge.drained()
+        judge.progress.drained()
         await asyncio.sleep(30.0)
 
 
@@ -166,7 +167,7 @@ def _refused(judge: Judge, gremlin: Gremlin, name: str, error: BaseException) ->
     """A service ended by itself: its own decision, or one that no disk fault explains."""
     gremlin.counts["service_ended_itself"] += 1
     gremlin.touch(name)
-    judge.breach("I4", f"{name} ended by itself: {_told(error)}")
+    judge.ended_itself(name, _told(error))
 
 
 def _told(error: BaseException) -> str:

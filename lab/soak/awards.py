@@ -1,0 +1,100 @@
+"""Who got a task, and why he (I1, I10): judged by the awards and the bids on the wire."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict, deque
+from dataclasses import dataclass
+
+from core.mesh.client import Answer
+from core.wire.market import BID_WINDOW_S, Bid, BidRound, Task
+from lab.soak.case import Case
+from lab.soak.net import Message
+
+BIDS_KEPT = 40
+ONE_ROUND_S = 1.0
+"""Bids that were asked for within so short a time belong to one round."""
+
+
+@dataclass(slots=True)
+class _Heard:
+    """A bid that came to its plant."""
+
+    sent_s: float
+    heard_s: float
+    robot_id: str
+    cost_s: float | None
+
+
+class Awards:
+    """Every award on the wire, and every round that a document tells of."""
+
+    def __init__(self, case: Case) -> None:
+        self._case = case
+        self._asked: dict[int, float] = {}
+        """When a question for a bid came to its robot, by the message's number."""
+        self._bids: defaultdict[str, deque[_Heard]] = defaultdict(lambda: deque(maxlen=BIDS_KEPT))
+        self._rounds: set[tuple[str, int]] = set()
+        self._lives: dict[str, object] = {}
+
+    def awarded(self, message: Message) -> None:
+        """I1: one epoch, one robot."""
+        award = json.loads(message.body)
+        task_id, epoch = award["announcement"]["task_id"], award["epoch"]
+        holder = self._case.awards.setdefault((task_id, epoch), message.target)
+        if holder != message.target:
+            self._case.breach("I1", f"{task_id} epoch {epoch} was awarded to {holder} and to {message.target}")
+
+    def asked(self, message: Message) -> None:
+        """A robot is asked for a bid."""
+        self._asked[message.number] = self._case.truth.now()
+
+    def heard(self, message: Message, answer: Answer) -> None:
+        """A robot's answer has come to its plant."""
+        sent_s = self._asked.pop(message.number, self._case.truth.now())
+        if answer.status == 200:
+            bid = json.loads(answer.body)
+            heard = _Heard(sent_s, self._case.truth.now(), message.target, bid["cost_s"])
+            self._bids[bid["task_id"]].append(heard)
+
+    def read(self, plant_id: str, task: Task) -> None:
+        """I10: the rounds of a task as they are on disk."""
+        for entry in task.rounds:
+            if entry.winner and (task.task_id, entry.epoch) not in self._rounds:
+                self._rounds.add((task.task_id, entry.epoch))
+                self._round(plant_id, task, entry)
+
+    def _round(self, plant_id: str, task: Task, entry: BidRound) -> None:
+        """The cheapest won, of those in the round and of those that came."""
+        case = self._case
+        if not self._same_life(plant_id):
+            return  # its times are those of a clock that is gone
+        offers = [bid for bid in entry.bids if bid.cost_s is not None]
+        won = next((bid for bid in offers if bid.robot_id == entry.winner), None)
+        if won is None or won.cost_s is None:
+            return case.breach("I10", f"{task.task_id} went to {entry.winner}, which offered nothing")
+        best = min(offers, key=_price)
+        if _price(best) < _price(won):
+            case.breach("I10", f"{task.task_id} went to {entry.winner} at {won.cost_s:.1f} s, not to {best.robot_id}")
+        counted = {bid.robot_id for bid in offers}
+        for heard in self._came(task.task_id, case.loop_s(plant_id, entry.t_s)):
+            cost_s = math.inf if heard.cost_s is None else heard.cost_s
+            if (cost_s, heard.robot_id) < _price(won) and heard.robot_id not in counted:
+                case.breach("I10", f"{task.task_id} went to {entry.winner}, though {heard.robot_id} offered {cost_s:.1f} s")
+
+    def _came(self, task_id: str, closed_s: float) -> list[_Heard]:
+        """The bids that were asked for in the round that closed then, and that came in time."""
+        sent = [h for h in self._bids[task_id] if closed_s - BID_WINDOW_S - 0.1 <= h.sent_s <= closed_s]
+        newest_s = max((h.sent_s for h in sent), default=0.0)
+        return [h for h in sent if h.sent_s >= newest_s - ONE_ROUND_S and h.heard_s <= closed_s - 0.005]
+
+    def _same_life(self, plant_id: str) -> bool:
+        life = self._case.garden.running[plant_id].life
+        before = self._lives.setdefault(plant_id, life)
+        self._lives[plant_id] = life
+        return before is life
+
+
+def _price(bid: Bid) -> tuple[float, str]:
+    return (math.inf if bid.cost_s is None else bid.cost_s, bid.robot_id)
