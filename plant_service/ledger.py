@@ -68,8 +68,7 @@ def begun(task: Task, permit: Permit, fruit: Fruit | None, now_s: float) -> Ledg
 def ended(task: Task, pick: Pick, robot_id: str, fruit: Fruit | None, before: LedgerLine | None, now_s: float) -> LedgerLine:
     """The line of a pick whose end was told; of the line `before` it, or of the fruit as it was."""
     told = {
-        "outcome": pick.outcome, "reason": pick.reason, "ended_s": now_s, "torn_green": pick.torn_green,
-        "torn_other": pick.torn_other, "robot_id": robot_id,
+        "outcome": pick.outcome, "reason": pick.reason, "ended_s": now_s, "robot_id": robot_id,
     }  # fmt: skip
     line = before
     if line is None:

@@ -86,6 +86,8 @@ def _soil(pot: Pot) -> Iterator[Reading]:
 def _fruit(pot: Pot) -> Iterator[Reading]:
     for colour, count in pot.tending.counts():
         yield Reading("garden_fruit", "Fruit of the inventory", count, {"colour": colour})
+        told = "Fruit that a scan found gone and nobody told of: torn, fallen, or never there"
+        yield Reading("garden_fruit_lost_total", told, pot.tending.lost[colour], {"colour": colour})
     yield Reading("garden_fruit_uncertainty_ratio", "0 just scanned, 1 nothing known", pot.tending.uncertainty())
 
 

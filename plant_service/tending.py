@@ -7,6 +7,7 @@ report, which tells every pick again, or by a scan.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from starlette.responses import Response
@@ -48,6 +49,8 @@ class Tending:
     ) -> None:
         self.shelf, self.ledger = shelf, book
         self._fruits, self._place, self._clock, self._journal = fruits, place, clock, journal
+        self.lost: Counter[str] = Counter()
+        """By colour: fruit that scans found gone and nobody told of, since the process began."""
 
     # What others read
 
@@ -88,6 +91,7 @@ class Tending:
         if scan.task_id and robot_id:
             await self._place.change(lambda m, at_s: m.scanned(scan.task_id, robot_id, scan.scan_id, at_s))
         await self._show(now_s)
+        self.lost.update(left.lost for left in merged.left if left.lost)
         gone = "".join(f"; {left.fruit_id} left: {left.why}" for left in merged.left)
         told = f"{len(scan.sightings)} fruit seen, {len(merged.new)} of them new{gone}"
         self._journal.note("scan", told[:500], task_id=scan.task_id, robot_id=robot_id)

@@ -19,7 +19,7 @@ from core.growth.stages import COLOURS, DAY_S, MISTAKE
 from core.inventory.matching import assign
 from core.inventory.track import Eye, Place, Track, logit, point, probability
 from core.inventory.view import blocked, in_view
-from core.wire.fruit import Accuracy, Fruit, Scan, Sighting, View
+from core.wire.fruit import Accuracy, Colour, Fruit, Scan, Sighting, View
 
 GATE = 16.0
 """A pair costs at most so much: squares of sigmas for the distance and the size, twice the log of the colour's odds."""
@@ -68,6 +68,8 @@ class Left:
 
     fruit_id: str
     why: str
+    lost: Colour | None = None
+    """Its colour when it hangs there no longer and nobody told of a pick; None when another entry stands for it."""
 
 
 @dataclass(slots=True)
@@ -329,10 +331,12 @@ def _keep(before: Track, after: Track, *, seen: bool, merged: Merged) -> None:
         if seen or gone:
             merged.settled[fruit.fruit_id] = seen
         if gone and not seen:
-            merged.left.append(Left(fruit.fruit_id, "a pick was permitted, and a scan does not see it any more"))
+            merged.left.append(
+                Left(fruit.fruit_id, "a pick was permitted, and a scan does not see it any more", fruit.colour)
+            )
             return
     if after.fruit.confidence < FLOOR and not after.fruit.in_doubt:
-        merged.left.append(Left(fruit.fruit_id, f"not seen any more: confidence {after.fruit.confidence:.2f}"))
+        merged.left.append(Left(fruit.fruit_id, f"not seen any more: confidence {after.fruit.confidence:.2f}", fruit.colour))
         return
     merged.tracks.append(after)
 

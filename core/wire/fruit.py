@@ -154,9 +154,6 @@ class Pick(Document):
     """Empty when no permit was taken: nothing was touched."""
     gone: bool = False
     """Of one that failed: the fruit came off and fell; it hangs there no longer."""
-    torn_green: Annotated[int, Field(ge=0, le=100)] = 0
-    torn_other: Annotated[int, Field(ge=0, le=100)] = 0
-    """Neighbours that came off with it, as far as the robot saw."""
     took_s: Seconds = 0.0
 
 
@@ -229,8 +226,6 @@ class LedgerLine(Document):
     outcome: Literal["permitted", "picked", "failed", "unreachable", "in_doubt", "gone", "hanging"]
     """`permitted`: under way. `in_doubt`: nobody told; a scan then found it `gone` or still `hanging`."""
     reason: Sentence = ""
-    torn_green: Count = 0
-    torn_other: Count = 0
     before: Annotated[str, Field(max_length=200)] = ""
     """Path of the picture before the pick at this plant; empty: none."""
     after: Annotated[str, Field(max_length=200)] = ""

@@ -39,8 +39,7 @@ SCAN = {
     "detector": {"recall": 0.8, "precision": 0.9}, "fruits": [SEEN],
 }  # fmt: skip
 PICK = {
-    "fruit_id": "f1", "outcome": "failed", "reason": "slipped", "permit_id": "", "torn_green": 0, "torn_other": 0,
-    "took_s": 9.0,
+    "fruit_id": "f1", "outcome": "failed", "reason": "slipped", "permit_id": "", "took_s": 9.0,
 }  # fmt: skip
 REPORT = {
     "robot_id": "robot-1", "epoch": 1, "state": "running", "phase": "drive", "progress": 0.5, "reason": "",

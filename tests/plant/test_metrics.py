@@ -18,6 +18,7 @@ from plant_service.metrics import stores
 from plant_service.station import Meter, TapDocument
 
 Play = Callable[[Any], None]
+TREE = {(0.1, 0.06 * i - 0.15, 0.2): "green" for i in range(6)}
 _LINE = re.compile(r"^(\w+)(?:\{(.*)\})? (\S+)$")
 
 
@@ -132,3 +133,29 @@ def test_a_disk_that_fails_shows_as_a_failure_and_a_store_that_acknowledges_noth
 
     values = run_virtual(told())
     assert values["garden_store_broken"] == values["garden_store_failures_total"] == 1
+
+
+def test_a_fruit_that_scans_do_not_find_any_more_is_counted_as_lost(play: Play) -> None:
+    async def story(garden: Any) -> None:
+        robot = garden.picker("robot-1", dict(TREE))
+        garden.pot(ratio=0.3, inventory=True)
+
+        async def scanned(times: int) -> bool:
+            return bool(robot.scans >= times)
+
+        await garden.until(lambda: scanned(1), 200.0)
+        assert 'garden_fruit_lost_total{colour="green"}' in await read(garden)
+        assert (await read(garden))['garden_fruit_lost_total{colour="green"}'] == 0
+        robot.tree.popitem()
+        lost = 0.0
+        for number in range(2, 8):
+            await garden.call("plant-1", "POST", "/tasks", json={"kind": "inventory"})
+            await garden.until(lambda n=number: scanned(n), 200.0)
+            await garden.clock.sleep(5.0)
+            lost = (await read(garden))['garden_fruit_lost_total{colour="green"}']
+            if lost:
+                break
+        assert lost == 1
+        assert (await read(garden))['garden_fruit{colour="green"}'] == 5
+
+    play(story)
