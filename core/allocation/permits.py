@@ -52,6 +52,7 @@ class OpenPermit(Document):
 class Dose(Document):
     permit_id: Identifier
     t_s: float
+    """When it has flowed at the latest [garden s]."""
     ml: Millilitres
 
 
@@ -71,8 +72,19 @@ def given_ml(doses: Sequence[Dose], now_s: float) -> float:
 
 
 def recent(doses: Sequence[Dose], now_s: float) -> list[Dose]:
-    """Doses that still count; one from the future (a clock that began anew) counts from now."""
-    return [d.model_copy(update={"t_s": min(d.t_s, now_s)}) for d in doses if d.t_s > now_s - DAY_S]
+    """Doses that still count."""
+    return [dose for dose in doses if dose.t_s > now_s - DAY_S]
+
+
+def revived(doses: Sequence[Dose], at_s: float | None, now_s: float) -> list[Dose]:
+    """The doses of a document of `at_s`, by a clock that may not be the one of now: as old as they were then.
+
+    How long the plant was off nobody can say for sure, so that time does not count. `at_s` None: not known; then a dose
+    from the future counts from now.
+    """
+    if at_s is None:
+        return [d.model_copy(update={"t_s": min(d.t_s, now_s)}) for d in recent(doses, now_s)]
+    return [d.model_copy(update={"t_s": d.t_s - at_s + now_s}) for d in recent(doses, at_s)]
 
 
 def corrected(doses: Sequence[Dose], permit_id: str, delivered_ml: float) -> list[Dose]:

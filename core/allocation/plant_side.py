@@ -36,7 +36,7 @@ class Market(TaskBook):
         before = document or MarketDocument()
         super().__init__(card, before, now_s, rules)
         self.limits = limits or Limits()
-        self._water = Watering(before.open_permit, before.doses, now_s, self.limits)
+        self._water = Watering(before.open_permit, before.doses, now_s, self.limits, before.doses_at_s)
         self._picks = Picking(before.open_pick, before.doubts, now_s)
         self._scanned = dict(before.scanned)
         if (held := self._water.open) is not None:
@@ -90,7 +90,8 @@ class Market(TaskBook):
         return MarketDocument(
             boot=self._names.boot, tasks=list(self._tasks.values()),
             failures={k: v for k, v in self._failures.items() if k in self._tasks}, open_permit=self._water.open,
-            doses=list(self._water.doses), open_pick=self._picks.open, doubts=list(self._picks.doubts.values()),
+            doses=list(self._water.doses), doses_at_s=self._water.at_s, open_pick=self._picks.open,
+            doubts=list(self._picks.doubts.values()),
             scanned={k: v for k, v in self._scanned.items() if k in self._tasks},
         )  # fmt: skip
 

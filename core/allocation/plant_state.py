@@ -69,6 +69,8 @@ class MarketDocument(Document):
     open_permit: OpenPermit | None = None
     """Of a dose."""
     doses: list[Dose] = []
+    doses_at_s: float | None = None
+    """The garden time as of which the doses are told."""
     open_pick: OpenPick | None = None
     doubts: list[OpenPick] = []
     """Picks that were permitted and that nobody told the end of."""

@@ -34,12 +34,20 @@ class Measured:
 
 
 class Watering:
-    """The soil as last measured, the day's doses, and the permit that is not settled yet."""
+    """The soil as last measured, the day's doses, and the permit that is not settled yet; `at_s` is when that was."""
 
-    def __init__(self, open_permit: OpenPermit | None, doses: Sequence[Dose], now_s: float, limits: Limits) -> None:
+    def __init__(
+        self,
+        open_permit: OpenPermit | None,
+        doses: Sequence[Dose],
+        now_s: float,
+        limits: Limits,
+        doses_at_s: float | None = None,
+    ) -> None:
+        """`doses_at_s` is the time of the clock of before at which the doses were written down."""
         self.limits = limits
         self.soil = Soil(None, "not measured yet", -math.inf)
-        self.doses = permits.recent(doses, now_s)
+        self.doses, self.at_s = permits.revived(doses, doses_at_s, now_s), now_s
         # The clock of before may not be this one: an open permit waits its whole time anew.
         self.open = None if open_permit is None else open_permit.model_copy(update={"issued_s": now_s})
         self.settle_at_s = math.inf
@@ -61,8 +69,8 @@ class Watering:
         """The dose is debited before the permit leaves."""
         before = self.soil.ratio if self.soil.ratio is not None else 0.0
         self.open = OpenPermit(permit=permit, robot_id=robot_id, key=key, issued_s=now_s, before_ratio=before)
-        self.settle_at_s = math.inf
-        dose = Dose(permit_id=permit.permit_id, t_s=now_s, ml=permit.dose_ml)
+        self.settle_at_s, self.at_s = math.inf, now_s
+        dose = Dose(permit_id=permit.permit_id, t_s=self.open.act_over_s(), ml=permit.dose_ml)
         self.doses = [*permits.recent(self.doses, now_s), dose]
 
     def holds(self, task_id: str, robot_id: str, epoch: int) -> bool:
@@ -96,7 +104,7 @@ class Watering:
 
     def measured(self, ratio: float | None, why: str, now_s: float) -> Measured | None:
         """A judged reading; settles the open permit when its time has come."""
-        self.soil = Soil(ratio, why, now_s)
+        self.soil, self.at_s = Soil(ratio, why, now_s), now_s
         if self.open is None or ratio is None or now_s < self.settle_at_s:
             return None
         settled = Measured(self.open, ratio)

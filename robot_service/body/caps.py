@@ -70,9 +70,11 @@ class Ledger:
         except ValidationError as error:
             raise StorageError(f"{self._document.path} is not a list of doses: {error}") from error
         self._spent = dict.fromkeys(doses.spent, 0.0)
-        now_s = self._clock.now()
-        # A clock that began anew must not make old doses young for ever, nor forget them.
-        self._recent = [_Debit(at_s=min(d.at_s, now_s), dose_ml=d.dose_ml) for d in doses.recent]
+        # The clock of before may not be this one, and how long the body was off nobody can say for sure: that time does
+        # not count. Every dose is as old as it was when the last one was written.
+        newest_s = max((d.at_s for d in doses.recent), default=0.0)
+        shift_s = self._clock.now() - newest_s
+        self._recent = [_Debit(at_s=d.at_s + shift_s, dose_ml=d.dose_ml) for d in doses.recent]
 
     def close(self) -> None:
         self._document.close()

@@ -11,7 +11,7 @@ import pytest
 
 from core.allocation.auction import Round, better_than_holder, cheapest, no_bid
 from core.allocation.epochs import owner_of
-from core.allocation.permits import DAY_S, Dose, given_ml, recent, rise_needed
+from core.allocation.permits import DAY_S, Dose, given_ml, revived, rise_needed
 from core.allocation.plant_side import Market
 from core.allocation.plant_state import Grant, Kill, Limits, MarketDocument, Solicit
 from core.errors import Conflict, NotFound, Refused
@@ -81,11 +81,21 @@ def test_an_id_tells_its_plant(text: str, owner: str) -> None:
     assert owner_of(text) == owner
 
 
-def test_doses_count_for_a_day_also_when_the_clock_began_anew() -> None:
+@pytest.mark.parametrize("now_s", [1000.0, 90000.0, 1e6])
+def test_doses_count_for_a_day_of_the_plants_own_life_whatever_clock_it_wakes_to(now_s: float) -> None:
+    doses = [Dose(permit_id="a", t_s=89000.0, ml=100.0), Dose(permit_id="b", t_s=90000.0, ml=50.0)]
+    woken = revived(doses, 90010.0, now_s)
+    assert given_ml(woken, now_s + DAY_S - 1011.0) == 150.0
+    assert given_ml(woken, now_s + DAY_S - 1009.0) == 50.0
+    assert given_ml(woken, now_s + DAY_S - 9.0) == 0.0
+
+
+def test_doses_of_an_old_document_count_for_a_day_also_when_the_clock_began_anew() -> None:
     doses = [Dose(permit_id="a", t_s=0.0, ml=100.0), Dose(permit_id="b", t_s=90000.0, ml=50.0)]
-    assert given_ml(doses, 1000.0) == 150.0
-    assert given_ml(recent(doses, 1000.0), 1000.0 + DAY_S - 1.0) == 50.0
-    assert given_ml(recent(doses, 1000.0), 1000.0 + DAY_S + 1.0) == 0.0
+    woken = revived(doses, None, 1000.0)
+    assert given_ml(woken, 1000.0) == 150.0
+    assert given_ml(woken, 1000.0 + DAY_S - 1.0) == 50.0
+    assert given_ml(woken, 1000.0 + DAY_S + 1.0) == 0.0
 
 
 def test_the_rise_asked_for_is_below_what_a_dose_does() -> None:

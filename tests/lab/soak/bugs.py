@@ -271,8 +271,8 @@ def a_restarted_plant_trusts_an_old_permit_time():
     """An open permit's time counts from the clock of before, which was another one."""
     real = Watering.__init__
 
-    def trusting(self, open_permit, doses, now_s, limits):
-        real(self, open_permit, doses, now_s, limits)
+    def trusting(self, open_permit, *more):
+        real(self, open_permit, *more)
         self.open = open_permit
 
     with mock.patch.object(Watering, "__init__", trusting):

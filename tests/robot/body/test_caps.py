@@ -69,12 +69,13 @@ def test_a_permit_is_written_off_once(tmp_path: Path) -> None:
     run_virtual(main())
 
 
-def test_doses_of_a_clock_that_began_anew_still_count_for_a_day_and_no_longer(tmp_path: Path) -> None:
+@pytest.mark.parametrize("wakes_s", [5.0, 1e6, 1e7], ids=["began-anew", "went-on", "leapt"])
+def test_doses_of_another_clock_still_count_for_a_day_and_no_longer(tmp_path: Path, wakes_s: float) -> None:
     async def main() -> None:
         before = opened(tmp_path, VirtualClock(1e6))
         await before.debit("a", 100.0)
         before.close()
-        clock = VirtualClock(5.0)
+        clock = VirtualClock(wakes_s)
         after = opened(tmp_path, clock)
         assert after.spent("a")
         assert "hour" in after.refusal(60.0)
