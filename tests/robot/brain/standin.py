@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import math
 import random
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from fastapi import FastAPI
@@ -24,7 +24,7 @@ from core.mesh.auth import GardenKey
 from core.mesh.chassis import allow, body, create_app
 from core.mesh.peers import Peer, Peers
 from core.robots import gardener
-from core.robots.garden_map import GardenMap, map_of
+from core.robots.garden_map import GardenMap, KnownPot, map_of
 from core.robots.markers import ceiling_markers
 from core.scenario import Scenario, find
 from core.virtual import run_virtual
@@ -397,10 +397,19 @@ def _dock_routes(app: FastAPI, docks: Docks, clock: VirtualClock) -> None:
 class Garden:
     """Brains on stand-in bodies in the default garden, with fake plants and station."""
 
-    def __init__(self, seed: int = 1, scenario: Scenario | None = None, robots: int = 1, **settings: object) -> None:
+    def __init__(
+        self,
+        seed: int = 1,
+        scenario: Scenario | None = None,
+        robots: int = 1,
+        walls: Sequence[KnownPot] = (),
+        **settings: object,
+    ) -> None:
+        """`walls`: more discs on everybody's map and in the world; `settings` are every robot's."""
         self.seed, self.clock = seed, VirtualClock()
         self.scenario = scenario or find("garden")
-        self.map = map_of(self.scenario)
+        known = map_of(self.scenario)
+        self.map = known.model_copy(update={"pots": [*known.pots, *walls]})
         self.net, self.mesh = MemoryNet(self.clock), MemoryMesh(self.clock, random.Random(seed))
         self.plane = Plane(self.map)
         self.key = GardenKey.from_seed(seed)
