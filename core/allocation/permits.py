@@ -17,8 +17,8 @@ PERMIT_VALID_S = 15.0
 FLOW_MLPS_MIN = 5.0
 """The slowest pump we reckon with: a dose is over after dose / this."""
 ACT_EXTRA_S = 5.0
-DOSE_ML_MIN = 5.0
-"""Less than this is not worth a robot's way."""
+DOSE_ML_MIN = 30.0
+"""With less of the day's cap left none is given: its rise could not be told from the probe's noise."""
 
 
 class OpenPermit(Document):

@@ -286,6 +286,9 @@ class Market(TaskBook):
             return math.inf
         return self._picks.clear_s() if task.kind == "inventory" else -math.inf
 
+    def _in_vain(self, task: Task, now_s: float) -> str:
+        return self._water.spent(now_s) if task.kind == "water" else ""
+
     def _permit_due_s(self, task: Task, live: Live) -> float | None:
         if self._water.holds(task.task_id, task.robot_id, task.epoch):
             finished = self._water.open is not None and self._water.open.finished

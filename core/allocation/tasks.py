@@ -38,6 +38,10 @@ class TaskBook:
         """No robot need be asked before then; infinite while something else must happen first."""
         return -math.inf
 
+    def _in_vain(self, task: Task, now_s: float) -> str:
+        """Why no robot could do it whoever came, so that it ends; empty otherwise."""
+        return ""
+
     def _permit_due_s(self, task: Task, live: Live) -> float | None:
         """While the holder has a permit: when the plant stops waiting for its word; None without a permit."""
         return None
@@ -119,6 +123,8 @@ class TaskBook:
                 self._too_late(task, now_s)
             elif live.round is not None and now_s >= live.round.deadline_s:
                 self._close_round(task, live.round, now_s)
+            elif task.state == "announced" and (why := self._in_vain(task, now_s)):
+                self._finish(task, "failed", why, now_s)
             elif task.state == "announced":
                 self._open_round(task, "award", robots, now_s)
             else:

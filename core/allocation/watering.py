@@ -62,8 +62,12 @@ class Watering:
         """Raises Refused when a dose could not be verified, or the day's are given."""
         if self.soil.ratio is None:
             raise Refused(f"the soil probe is {self.soil.why}: a dose could not be verified", hint="mend the probe first")
-        if self.left_ml(now_s) < permits.DOSE_ML_MIN:
-            raise Refused(f"the day's {self.limits.day_cap_ml:.0f} ml are given", hint="wait, or raise day_cap_ml")
+        if why := self.spent(now_s):
+            raise Refused(why, hint="wait, or raise day_cap_ml")
+
+    def spent(self, now_s: float) -> str:
+        """That the day's doses are given; empty while they are not."""
+        return f"the day's {self.limits.day_cap_ml:.0f} ml are given" if self.left_ml(now_s) < permits.DOSE_ML_MIN else ""
 
     def issue(self, permit: Permit, robot_id: str, key: str, now_s: float) -> None:
         """The dose is debited before the permit leaves."""

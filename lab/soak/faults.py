@@ -52,7 +52,7 @@ FATAL = {
 DISK = ("crash_before_write", "crash_in_write", "crash_after_write", "disk_eio", "disk_enospc", "torn_write", "fsync_error")
 LATE_PERMIT_S = (10.0, 60.0)
 MEND_AFTER_S = 45.0
-WEAK_RATIO = 0.4
+WEAK_RATIO = 0.6
 """A robot with less than this would charge for most of a calm, and its tasks wait for it."""
 
 

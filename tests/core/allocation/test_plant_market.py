@@ -252,6 +252,20 @@ def test_the_day_cap_cuts_the_dose_and_then_refuses() -> None:
         made.ask("water", 150.0, "soil", "dry", 61.0)
 
 
+def test_when_the_days_cap_is_reached_an_open_watering_ends_and_says_so_and_nobody_comes_for_it() -> None:
+    made = market()
+    made.limits.day_cap_ml = 170.0
+    task_id = awarded(made)
+    made.permit(task_id, request(), "", 1.0)
+    report(made, task_id, "done", 2.0, delivered_ml=150.0)
+    made.soil(0.15, "", 60.0)
+    assert made.task(task_id).state == "announced"
+    made.take_effects()
+    made.tick(61.0, ROBOTS)
+    assert (made.task(task_id).state, made.task(task_id).reason) == ("failed", "the day's 170 ml are given")
+    assert not [e for e in made.take_effects() if isinstance(e, Solicit)]
+
+
 def test_a_robot_that_keeps_a_task_without_acting_loses_it() -> None:
     made = market()
     task_id = awarded(made)
