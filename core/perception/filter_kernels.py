@@ -22,23 +22,23 @@ STRIDE_FROM_PX = 9.0
 
 
 @njit(cache=True, fastmath=True)
-def planes(image: Bytes, bins: Bytes, luma: Floats, table: Floats, out: Floats) -> None:
+def planes(image: Bytes, bins: Ints, luma: Floats, table: Floats, shares: Floats, out: Floats) -> None:
     """Colour planes of an image in one pass.
 
     `bins` (3, 256) and `luma` (3, 256) hold each channel's balanced value as a bin of 0..31 and as its share of brightness;
-    `table` (32768, 2) how likely a colour is red and green fruit. `out` (4, h, w): red, green, brightness, whiteness.
+    `table` (32768, 2) how likely a colour is red and green fruit; `shares` (32, 32) the least of a colour's bins over its
+    largest. `out` (4, h, w): red, green, brightness, whiteness.
     """
     height, width = image.shape[:2]
     for y in range(height):
         for x in range(width):
             b, g, r = image[y, x, 0], image[y, x, 1], image[y, x, 2]
             kb, kg, kr = bins[0, b], bins[1, g], bins[2, r]
-            index = (np.int32(kb) << 10) | (np.int32(kg) << 5) | np.int32(kr)
+            index = (kb << 10) | (kg << 5) | kr
             out[0, y, x] = table[index, 0]
             out[1, y, x] = table[index, 1]
             out[2, y, x] = luma[0, b] + luma[1, g] + luma[2, r]
-            most = max(kb, kg, kr)
-            out[3, y, x] = np.float32(min(kb, kg, kr)) / np.float32(max(most, 1))
+            out[3, y, x] = shares[min(kb, kg, kr), max(kb, kg, kr)]
 
 
 @njit(cache=True, fastmath=True)
@@ -68,12 +68,14 @@ def rise(brightness: Floats, around: Floats, whiteness: Floats, least: float, ou
 
 
 @njit(cache=True, fastmath=True)
-def bright_colour(maps: Floats, family: int, plane: Floats, source: Floats) -> None:
-    """A colour plane (h, w), and the same weighted by brightness: a ball's middle is brighter than its rim."""
-    for y in range(plane.shape[0]):
-        for x in range(plane.shape[1]):
-            plane[y, x] = maps[y, x, family]
-            source[y, x] = maps[y, x, family] * (np.float32(0.35) + np.float32(0.65) * maps[y, x, 2])
+def bright_colours(maps: Floats, colours: Floats, sources: Floats) -> None:
+    """Both colour planes (2, h, w), and the same weighted by brightness: a ball's middle is brighter than its rim."""
+    for y in range(maps.shape[0]):
+        for x in range(maps.shape[1]):
+            weight = np.float32(0.35) + np.float32(0.65) * maps[y, x, 2]
+            for family in range(2):
+                colours[family, y, x] = maps[y, x, family]
+                sources[family, y, x] = maps[y, x, family] * weight
 
 
 @njit(cache=True, fastmath=True)
@@ -130,22 +132,25 @@ def vote(image: Floats, steep: float, radius_min: int, radius_max: int, out: Flo
     """
     height, width = image.shape
     out[:] = 0
-    weights = np.empty(radius_max + 1)
+    weights = np.empty(radius_max + 1, np.float32)
     for radius in range(radius_min, radius_max + 1):
         weights[radius] = 1.0 / (2.0 * math.pi * radius)
+    least, half, one = np.float32(steep * steep), np.float32(0.5), np.float32(1)
     for y in range(1, height - 1):
+        above, row, below = image[y - 1], image[y], image[y + 1]
         for x in range(1, width - 1):
-            gx = image[y, x + 1] - image[y, x - 1]
-            gy = image[y + 1, x] - image[y - 1, x]
+            gx = row[x + 1] - row[x - 1]
+            gy = below[x] - above[x]
             square = gx * gx + gy * gy
-            if square < steep * steep:
+            if square < least:
                 continue
-            size = math.sqrt(square)
-            gx /= size
-            gy /= size
+            size = one / np.sqrt(square)
+            gx *= size
+            gy *= size
+            at_x, at_y = np.float32(x) + half, np.float32(y) + half
             for radius in range(radius_min, radius_max + 1):
-                u = int(x + gx * radius + 0.5)
-                v = int(y + gy * radius + 0.5)
+                u = np.int32(at_x + gx * np.float32(radius))
+                v = np.int32(at_y + gy * np.float32(radius))
                 if 0 <= u < width and 0 <= v < height:
                     out[v, u] += weights[radius]
 
@@ -252,19 +257,24 @@ def describe(
 
 
 @njit(cache=True, fastmath=True)
-def tint(image: Bytes, red: Floats, u: float, v: float, half: float) -> Floats:
-    """Mean blue, green and red (3,), 0..255, of the square round (u, v); pixels weigh by how likely red fruit they are."""
+def tints(image: Bytes, red: Floats, circles: Floats, share: float) -> Floats:
+    """Mean blue, green and red (n, 3), 0..255, of the squares in circles (n, 3: u, v, radius [px]), `share` of a radius to
+    each side, a pixel at least; pixels weigh by how likely red fruit they are."""
     height, width = red.shape
-    out = np.zeros(3, np.float32)
-    whole = np.float32(1e-6)
-    y0, x0 = min(max(int(v - half), 0), height - 1), min(max(int(u - half), 0), width - 1)
-    for y in range(y0, max(min(int(v + half) + 1, height), y0 + 1)):
-        for x in range(x0, max(min(int(u + half) + 1, width), x0 + 1)):
-            weight = red[y, x] + np.float32(1e-3)
-            whole += weight
-            for k in range(3):
-                out[k] += weight * image[y, x, k]
-    return out / whole
+    out = np.zeros((len(circles), 3), np.float32)
+    for i in range(len(circles)):
+        u, v, half = circles[i, 0], circles[i, 1], max(circles[i, 2] * share, 1.0)
+        whole = np.float32(1e-6)
+        y0, x0 = min(max(int(v - half), 0), height - 1), min(max(int(u - half), 0), width - 1)
+        for y in range(y0, max(min(int(v + half) + 1, height), y0 + 1)):
+            for x in range(x0, max(min(int(u + half) + 1, width), x0 + 1)):
+                weight = red[y, x] + np.float32(1e-3)
+                whole += weight
+                for k in range(3):
+                    out[i, k] += weight * image[y, x, k]
+        for k in range(3):
+            out[i, k] /= whole
+    return out
 
 
 @njit(cache=True)

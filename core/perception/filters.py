@@ -53,6 +53,8 @@ AREA_SCALE = 0.55
 """Pictures that shrink further are averaged over areas, others are interpolated."""
 VOTE_MIN = 0.30
 """Circle votes plus colour at a centre below which it is not looked at."""
+MIDDLE = 0.6
+"""Of a fruit's radius: so far from its centre it is asked for its tint."""
 CANDIDATES_MAX = 50
 """A pyramid level and colour."""
 
@@ -143,7 +145,7 @@ def detect(image: Image, weights: Weights, table: Floats) -> list[Detection]:
     circles, families, confidence = _judged(list(seen.candidates()), weights)
     order = np.argsort(-confidence)
     kept = order[kernels.distinct(circles[order], weights.apart)]
-    return [_detection(seen, circles[k], int(families[k]), float(confidence[k]), weights) for k in kept]
+    return _detections(seen, circles[kept], families[kept], confidence[kept], weights)
 
 
 def stages(image: Image) -> dict[str, Image | Floats]:
@@ -154,8 +156,9 @@ def stages(image: Image) -> dict[str, Image | Floats]:
     pictures: dict[str, Image | Floats] = {"balanced": np.clip(seen.image * seen.gains, 0, 255).astype(np.uint8)}
     looked_at = ("smooth", "red", "green", "highlight", "area_red", "area_green")
     pictures |= {name: np.ascontiguousarray(seen.maps[:, :, MAPS.index(name)]) for name in looked_at}
+    _, votes = circle_votes(seen.maps)
     for k, name in enumerate(FAMILIES):
-        pictures[f"circles_{name}"] = np.minimum(circle_votes(seen.maps, k)[1], 1)
+        pictures[f"circles_{name}"] = np.minimum(votes[k], 1)
         pictures[f"combined_{name}"] = np.zeros(seen.image.shape[:2], np.float32)
     for each in seen.candidates():
         drawn_on = f"combined_{FAMILIES[each.family]}"
@@ -217,13 +220,18 @@ def _logistic(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(1 / (1 + np.exp(-np.clip(x, -30, 30))), float)
 
 
-def _detection(seen: Seen, circle: Floats, family: int, confidence: float, weights: Weights) -> Detection:
-    colour: Colour = FAMILIES[family]
-    if colour == "red":
-        tint = seen.tint(circle)
-        colour = "red" if weights.ripe[0] + weights.ripe[1:] @ tint >= 0 else "turning"
-    u, v, radius = (float(value) for value in circle)
-    return Detection(u_px=u, v_px=v, radius_px=radius, colour=colour, confidence=confidence)
+def _detections(
+    seen: Seen, circles: Floats, families: NDArray[np.int64], confidences: NDArray[np.float64], weights: Weights
+) -> list[Detection]:
+    ripe = weights.ripe[0] + seen.tints(circles) @ weights.ripe[1:] >= 0
+    reds: tuple[Colour, Colour] = ("turning", "red")
+    colours = [
+        reds[int(is_ripe)] if family == 0 else FAMILIES[family] for family, is_ripe in zip(families, ripe, strict=True)
+    ]
+    return [
+        Detection(u_px=u, v_px=v, radius_px=radius, colour=colour, confidence=confidence)
+        for (u, v, radius), colour, confidence in zip(circles.tolist(), colours, confidences.tolist(), strict=True)
+    ]
 
 
 def colour_terms(bgr: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -264,10 +272,10 @@ class Seen:
         self.image = np.asarray(cv2.resize(image, size, interpolation=how), np.uint8)
         self.gains = gains_of(self.image, balance_norm)
         values = np.clip(np.arange(256)[None] / 255 * self.gains[:, None], 0, 1)
-        bins = np.minimum(values * BINS, BINS - 1).astype(np.uint8)
+        bins = np.minimum(values * BINS, BINS - 1).astype(np.int32)
         luma = (values * np.array(BGR_LUMA)[:, None]).astype(np.float32)
         colours = np.empty((4, *self.image.shape[:2]), np.float32)
-        kernels.planes(self.image, bins, luma, table, colours)
+        kernels.planes(self.image, bins, luma, table, _SHARES, colours)
         self.red, green, brightness, whiteness = colours
         smooth = smoothness(brightness)
         smoothed = 0.4 + 0.6 * smooth
@@ -279,14 +287,14 @@ class Seen:
         """Where circles and colour agree, for each size and colour."""
         maps, zoom = self.maps, 1.0
         for _ in range(LEVELS):
+            sources, votes = circle_votes(maps)
             for family in range(len(FAMILIES)):
-                yield self._level(maps, family, zoom)
+                yield self._level(maps, sources[family], votes[family], family, zoom)
             if min(maps.shape[:2]) < 4 * RADII_PX[1]:
                 break
             maps, zoom = kernels.halve(maps), zoom * 2
 
-    def _level(self, maps: Floats, family: int, zoom: float) -> Candidates:
-        source, votes = circle_votes(maps, family)
+    def _level(self, maps: Floats, source: Floats, votes: Floats, family: int, zoom: float) -> Candidates:
         points = kernels.tops(votes, VOTE_MIN, CANDIDATES_MAX)
         found = np.empty((len(points), len(FEATURES)), np.float32)
         kernels.describe(maps, source, votes, points, family, (RADII_PX[0] * 0.8, RADII_PX[1] * 1.3), SPOKES, found)
@@ -295,11 +303,10 @@ class Seen:
         circles = np.column_stack([(points + 0.5) * zoom, radius]) / self.scale
         return Candidates(family, circles.astype(np.float32), found)
 
-    def tint(self, circle: Floats) -> NDArray[np.float64]:
-        """Log of red over green and of blue over green (2,) in the middle of a circle, balanced."""
-        u, v, radius = (float(value) for value in circle * self.scale)
-        b, g, r = kernels.tint(self.image, self.red, u, v, max(radius * 0.6, 1.0)) / 255 * self.gains
-        return np.array([math.log((r + 0.02) / (g + 0.02)), math.log((b + 0.02) / (g + 0.02))])
+    def tints(self, circles: Floats) -> NDArray[np.float64]:
+        """Log of red over green and of blue over green (n, 2) in the middles of circles (n, 3), balanced."""
+        b, g, r = (kernels.tints(self.image, self.red, circles * np.float32(self.scale), MIDDLE) / 255 * self.gains + 0.02).T
+        return np.asarray(np.log(np.stack([r / g, b / g], axis=1)), float)
 
 
 def smoothness(brightness: Floats) -> Floats:
@@ -320,6 +327,7 @@ def highlights(brightness: Floats, whiteness: Floats) -> Floats:
 
 
 _NEAR = np.ones((3, 3), np.uint8)
+_SHARES = (np.arange(BINS)[:, None] / np.maximum(np.arange(BINS), 1)).astype(np.float32)
 
 
 def areas(plane: Floats, smooth: Floats) -> Floats:
@@ -333,12 +341,17 @@ def areas(plane: Floats, smooth: Floats) -> Floats:
     return np.asarray(cv2.resize(wanted[labels], (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def circle_votes(maps: Floats, family: int) -> tuple[Floats, Floats]:
-    """The plane whose discs are looked for (colour, brighter in the middle), and the votes for their centres (h, w)."""
-    plane, source = np.empty(maps.shape[:2], np.float32), np.empty(maps.shape[:2], np.float32)
-    kernels.bright_colour(maps, family, plane, source)
-    source = np.asarray(cv2.GaussianBlur(source, (3, 3), 0.8), np.float32)
-    votes = np.empty_like(source)
-    kernels.vote(source, STEEP, *RADII_PX, votes)
-    smoothed = np.asarray(cv2.GaussianBlur(votes, (5, 5), 1.2), np.float32)
-    return source, np.asarray(cv2.addWeighted(smoothed, 4.0, cv2.blur(plane, (5, 5)), 0.5, 0.0), np.float32)
+def circle_votes(maps: Floats) -> tuple[Floats, Floats]:
+    """Of each family the plane whose discs are looked for (colour, brighter in the middle), and the votes for their centres;
+    both (2, h, w)."""
+    shape = (len(FAMILIES), *maps.shape[:2])
+    colours, sources, votes = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+    kernels.bright_colours(maps, colours, sources)
+    smoothed = np.empty(shape[1:], np.float32)
+    for colour, source, vote in zip(colours, sources, votes, strict=True):
+        cv2.GaussianBlur(source, (3, 3), 0.8, dst=source)
+        kernels.vote(source, STEEP, *RADII_PX, vote)
+        cv2.GaussianBlur(vote, (5, 5), 1.2, dst=smoothed)
+        cv2.blur(colour, (5, 5), dst=vote)
+        cv2.addWeighted(smoothed, 4.0, vote, 0.5, 0.0, dst=vote)
+    return sources, votes

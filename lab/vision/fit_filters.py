@@ -352,7 +352,7 @@ def _ripe(samples: Sequence[Sample], seen: Sequence[Seen]) -> Array:
                 continue
             radius = (box.width_px + box.height_px) / 4
             circle = np.array([box.x_px + box.width_px / 2, box.y_px + box.height_px / 2, radius], np.float32)
-            tints.append(np.concatenate([[1.0], one.tint(circle)]))
+            tints.append(np.concatenate([[1.0], one.tints(circle[None])[0]]))
             red.append(int(box.label == "red"))
             sources.append(sample.source)
     y = np.array(red)
