@@ -143,11 +143,11 @@ def auction(round_: BidRound) -> Table:
     winner = round_.winner or "nobody"
     table = _table(
         f"At {round_.t_s:.1f} s (epoch {round_.epoch}): {winner} won. {round_.why}",
-        "robot", "cost s", "current", "queue", "travel", "work", "charge", "refill", "says",
+        "robot", "cost s", "current", "queue", "travel", "work", "charge", "refill", "others", "says",
     )  # fmt: skip
     for bid in sorted(round_.bids, key=_rank):
         parts = bid.breakdown
-        cells = (parts.current_s, parts.queue_s, parts.travel_s, parts.work_s, parts.charge_s, parts.refill_s)
+        cells = (parts.current_s, parts.queue_s, parts.travel_s, parts.work_s, parts.charge_s, parts.refill_s, parts.delay_s)
         cost = "no" if bid.cost_s is None else f"{bid.cost_s:.1f}"
         table.add_row(
             bid.robot_id, cost, *(f"{seconds:.1f}" if bid.cost_s is not None else "" for seconds in cells), bid.reason

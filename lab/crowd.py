@@ -18,6 +18,7 @@ from core.allocation.bidding import DOCKING_S, UNDOCKING_S, Condition, Stop, ins
 from core.allocation.plant_side import Market
 from core.allocation.plant_state import Effect, Grant, Kill, Rules, Solicit
 from core.allocation.queue import Entry, TaskQueue
+from core.allocation.reorder import better_order
 from core.errors import Refused
 from core.wire.geometry import Point3, Pose2
 from core.wire.market import Announcement, Award, Bid, PlantCard, Report, TaskKind
@@ -191,6 +192,7 @@ class Crowd:
         refused = ""
         try:
             worker.queue.award(award, self.now_s, insertion(award.announcement, self.condition(worker)))
+            worker.queue.arrange(better_order(self.condition(worker)))
         except Refused as error:
             refused = str(error)
         self._word(lambda: self._answered(number, award, refused))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import replace
 
 import httpx
 
@@ -11,6 +12,7 @@ from core.allocation import deadlines
 from core.allocation.bidding import OTHER_WORK_S, Condition, Stop, ride_s, work_s
 from core.allocation.epochs import owner_of
 from core.allocation.queue import Entry, TaskQueue
+from core.allocation.reorder import better_order
 from core.clock import Clock
 from core.errors import Forbidden, Refused, Unavailable, Unprocessable
 from core.geometry.pinhole import from_fov
@@ -183,7 +185,9 @@ class Brain:
         length_m = None if start is None else self.robot.ground.length_m(start, (goal[0], goal[1]))
         time_s = None if length_m is None else ride_s(length_m)
         if not here:
-            self._travels = {k: v for k, v in self._travels.items() if k[0] == key[0]} | {key: time_s}
+            if next(iter(self._travels), key)[0] != key[0]:
+                self._travels.clear()
+            self._travels[key] = time_s
         return time_s
 
     def _can(self) -> frozenset[str]:
@@ -250,10 +254,17 @@ class Brain:
             raise Unprocessable(f"cannot {award.announcement.kind}")
         at = deadlines.place(award.announcement, self.condition(), self._promised())
         entry = self.queue.award(award, self.clock.now(), at)
+        self._shorten_queue()
         self.robot.note("award", f"{entry.kind} for {plant_id}", task_id=entry.task_id, epoch=entry.epoch)
         self.scheduler.changed()
         self.reporter.soon()
         return queued(entry)
+
+    def _shorten_queue(self) -> None:
+        """Put what waits in a better order; what has a deadline keeps its place."""
+        me, due = self.condition(), {task.task_id for task in self._promised()}
+        queue = tuple(replace(stop, settled=stop.settled or stop.task_id in due) for stop in me.queue)
+        self.queue.arrange(better_order(replace(me, queue=queue)))
 
     def kill(self, task_id: str, caller: Caller, epoch: int | None = None) -> QueuedTask:
         """Kill task; a plant only its own. Raises Refused for an epoch that is over: that word came late."""

@@ -1,7 +1,9 @@
-"""A robot's price for a task: seconds until it would be done, with the breakdown, or the reason why not.
+"""A robot's price for a task in seconds that somebody waits, with the breakdown, or the reason why not.
 
+Those until it would be done, and those that all behind it wait longer for it: each task of the queue, and whoever asks next.
 Pure: what the robot knows of itself comes in as a `Condition`, distances through a function.
-Source: paper 000, section 7 (cost of distance, queue and abilities); charge and refill on the way are ours.
+Source: paper 000, section 7 (cost of distance, queue and abilities); Lagoudakis et al. 2005 (bids for the least mean
+waiting time, MiniAve); charge and refill on the way are ours.
 """
 
 from __future__ import annotations
@@ -92,11 +94,9 @@ class _Walk:
     docked: bool
     tank_ml: float
     battery_ratio: float
-    refilled_s: float = 0.0
-    """What of it went into ways to the tap and filling there."""
 
     def copy(self) -> _Walk:
-        return _Walk(self.me, self.place, self.docked, self.tank_ml, self.battery_ratio, self.refilled_s)
+        return _Walk(self.me, self.place, self.docked, self.tank_ml, self.battery_ratio)
 
     def go(self, dock: str) -> float | None:
         """Drive there and dock; the seconds it takes."""
@@ -134,7 +134,7 @@ class _Walk:
         if tap is None or (way_s := self.go(tap)) is None:
             return None
         spent_s = way_s + refill_s(max(0.0, self.tank_ml))
-        self.tank_ml, self.refilled_s = gardener.TANK_ML, self.refilled_s + spent_s
+        self.tank_ml = gardener.TANK_ML
         return spent_s
 
     def serve(self, stop: Stop) -> float | None:
@@ -191,8 +191,7 @@ def refill_s(tank_ml: float) -> float:
 def price(asked: Announcement, me: Condition) -> Bid:
     """The bid for `asked`: feasible with its breakdown, or cost None and the reason.
 
-    A task that is held already is priced where it stands. Any other goes where it adds least to the queue (cheapest
-    insertion), and its price is when all that is promised would be done with it (min-max).
+    A task that is held already is priced where it stands; any other goes where its price is least.
     """
     return offer(asked, me)[0]
 
@@ -211,11 +210,22 @@ def offer(asked: Announcement, me: Condition) -> tuple[Bid, int]:
         return _bid(asked, me, _Parts(current_s=current_s)), 0
     for index, stop in enumerate(me.queue):
         if stop.task_id == asked.task_id:
-            return _bid(asked, me, _inserted(asked, _Route(walk, me.queue[:index]), index, current_s)), index
+            others = _Route(walk, (*me.queue[:index], *me.queue[index + 1 :]))
+            return _bid(asked, me, _inserted(asked, others, index, current_s)), index
     route = _Route(walk, me.queue)
     tried = [(_inserted(asked, route, index, current_s), index) for index in _places(asked.priority, me.queue)]
     best, at = min(tried, key=lambda each: (*_rank(each[0]), -each[1]))
     return _bid(asked, me, best), at
+
+
+def queue_s(me: Condition, queue: Iterable[Stop]) -> float | None:
+    """Seconds until all of a queue would be done; None when something in it cannot be reached."""
+    walk, total_s = _begun(me)
+    for stop in queue:
+        if (spent_s := walk.serve(stop)) is None:
+            return None
+        total_s += spent_s
+    return total_s
 
 
 def _places(priority: int, queue: tuple[Stop, ...]) -> range:
@@ -234,6 +244,7 @@ class _Parts(NamedTuple):
     work_s: float = 0.0
     charge_s: float = 0.0
     refill_s: float = 0.0
+    delay_s: float = 0.0
 
 
 def _rank(parts: _Parts | str) -> tuple[bool, float]:
@@ -250,7 +261,7 @@ def _begun(me: Condition) -> tuple[_Walk, float]:
 
 
 class _Route:
-    """The queue as it is, walked through once: what every place of a further task is reckoned from."""
+    """A queue walked through once: what every place of a further task is reckoned from."""
 
     def __init__(self, walk: _Walk, queue: tuple[Stop, ...]) -> None:
         self.queue, self.barred = queue, ""
@@ -275,17 +286,20 @@ class _Route:
         hop_s = self._walks[0].hop_s(before, stop.dock) if plain and before else 0.0
         self._dry_s[i] = hop_s + stop.work_s + self._dry_s[i + 1]
 
-    @property
-    def alone_s(self) -> float:
-        """Seconds for the queue as it is, but for water fetched on the way."""
-        return self._spent_s[-1] - self._walks[-1].refilled_s
-
     def before(self, index: int) -> tuple[_Walk, float]:
         """The robot when it comes to this stop, and the seconds until then."""
         return self._walks[index].copy(), self._spent_s[index]
 
-    def behind_s(self, walk: _Walk, index: int) -> float | None:
-        """Seconds for this stop and all behind it, for a robot that comes from a task put in before it."""
+    def later_s(self, walk: _Walk, now_s: float, index: int) -> float | None:
+        """By how many seconds its end moves back for a robot that comes to this stop after `now_s`, from a task put in."""
+        if (behind_s := self._behind_s(walk, index)) is None:
+            return None
+        return max(0.0, now_s + behind_s - self._spent_s[-1])
+
+    def _behind_s(self, walk: _Walk, index: int) -> float | None:
+        """Seconds for this stop and all behind it."""
+        if index == len(self.queue):
+            return 0.0
         if (doses_ml := self._doses_ml[index]) == 0.0 or doses_ml + TANK_RESERVE_ML <= walk.tank_ml:
             first = self.queue[index]
             total_s = walk.hop_s(walk.place, first.dock) + first.work_s + self._dry_s[index + 1]
@@ -295,25 +309,18 @@ class _Route:
 
 
 def _inserted(asked: Announcement, route: _Route, index: int, current_s: float) -> _Parts | str:
-    """The bid's parts with the task at this place of the queue, or why not.
-
-    In the middle it is what the others need without it, and what it adds.
-    """
+    """The bid's parts with the task at this place of the queue, or why not."""
     if route.barred:
         return f"no way to {route.barred}, which is in the queue"
-    walk, queue_s = route.before(index)
+    walk, before_s = route.before(index)
     own = _own(asked, walk)
     if isinstance(own, str):
         return own
-    if index == len(route.queue):
-        return own._replace(current_s=current_s, queue_s=queue_s)
-    if (behind_s := route.behind_s(walk, index)) is None:
+    later_s = route.later_s(walk, before_s + sum(own), index)
+    if later_s is None:
         return "no way to what is later in the queue"
-    fixed_s = own.work_s + own.charge_s + walk.refilled_s
-    travel_s = queue_s + sum(own) + behind_s - route.alone_s - fixed_s
-    # Its way to tap or charger may save the others some of theirs.
-    alone_s = route.alone_s + min(0.0, travel_s)
-    return _Parts(current_s, alone_s, max(0.0, travel_s), own.work_s, own.charge_s, walk.refilled_s)
+    put_off = len(route.queue) - index + 1
+    return own._replace(current_s=current_s, queue_s=before_s, delay_s=put_off * later_s)
 
 
 def _unable(asked: Announcement, me: Condition) -> str:
@@ -354,9 +361,14 @@ def _own(asked: Announcement, walk: _Walk) -> _Parts | str:
     return _Parts(travel_s=travel_s, work_s=work, charge_s=charging_s, refill_s=water_s)
 
 
+def done_s(cost: Breakdown) -> float:
+    """Seconds until the task itself would be done."""
+    return cost.current_s + cost.queue_s + cost.travel_s + cost.work_s + cost.charge_s + cost.refill_s
+
+
 def total_s(cost: Breakdown) -> float:
     """The bid is the sum of its parts."""
-    return cost.current_s + cost.queue_s + cost.travel_s + cost.work_s + cost.charge_s + cost.refill_s
+    return done_s(cost) + cost.delay_s
 
 
 def _bid(asked: Announcement, me: Condition, parts: _Parts | str) -> Bid:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from core.allocation.bidding import Condition, Stop, insertion, price, work_s
+from core.allocation.bidding import Condition, Stop, done_s, insertion, price, work_s
 from core.wire.market import Announcement, Bid
 
 
@@ -24,10 +24,10 @@ def offer(asked: Announcement, me: Condition, promised: Sequence[Announcement] =
     bid = price(asked, chosen)
     if bid.cost_s is None or asked.within_s is None or _is_current(asked, me):
         return bid
-    done_s = _done_s(asked, chosen, insertion(asked, chosen))
-    if done_s is not None and done_s <= asked.within_s:
+    would_s = _done_s(asked, chosen, insertion(asked, chosen))
+    if would_s is not None and would_s <= asked.within_s:
         return bid
-    late = f"done in {done_s or bid.cost_s:.0f} s, the deadline is in {asked.within_s:.0f} s"
+    late = f"done in {would_s or bid.cost_s:.0f} s, the deadline is in {asked.within_s:.0f} s"
     return Bid(task_id=asked.task_id, robot_id=me.robot_id, cost_s=None, reason=late)
 
 
@@ -57,8 +57,8 @@ def _hurried(asked: Announcement, me: Condition) -> Condition:
 def _in_time(asked: Announcement, me: Condition, promised: Sequence[Announcement]) -> bool:
     """Put where `bidding` puts it, the task meets its deadline and makes no other miss one that would have been met."""
     at = insertion(asked, me)
-    done_s = _done_s(asked, me, at)
-    if done_s is None or (asked.within_s is not None and done_s > asked.within_s):
+    would_s = _done_s(asked, me, at)
+    if would_s is None or (asked.within_s is not None and would_s > asked.within_s):
         return False
     labour_s = work_s(asked.kind, asked.dose_ml, asked.count)
     new = Stop(dock=asked.plant.plant_id, work_s=labour_s, dose_ml=asked.dose_ml, task_id=asked.task_id)
@@ -69,14 +69,15 @@ def _in_time(asked: Announcement, me: Condition, promised: Sequence[Announcement
 
 def _meets(task: Announcement, me: Condition) -> bool:
     at = next(i for i, stop in enumerate(me.queue) if stop.task_id == task.task_id)
-    done_s = _done_s(task, me, at)
-    return done_s is not None and done_s <= (task.within_s or 0.0)
+    would_s = _done_s(task, me, at)
+    return would_s is not None and would_s <= (task.within_s or 0.0)
 
 
 def _done_s(task: Announcement, me: Condition, at: int) -> float | None:
     """Seconds until this one task is done as number `at` of the queue, whatever comes after it."""
     before = tuple(replace(stop, settled=True) for stop in me.queue[:at])
-    return price(task, replace(me, queue=before)).cost_s
+    bid = price(task, replace(me, queue=before))
+    return None if bid.cost_s is None else done_s(bid.breakdown)
 
 
 def _is_current(asked: Announcement, me: Condition) -> bool:

@@ -6,6 +6,7 @@ Pure. An award is known by (task_id, epoch): the same again changes nothing, an 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -100,6 +101,13 @@ class TaskQueue:
         if len(self.entries) >= QUEUE_MAX:
             raise Refused(f"the queue is full with {QUEUE_MAX} tasks")
         self.entries.insert(self._begun() if first else len(self.entries), entry)
+
+    def arrange(self, order: Sequence[int]) -> None:
+        """Put what has not begun in this order of its numbers."""
+        begun = self._begun()
+        waiting = self.entries[begun:]
+        assert sorted(order) == list(range(len(waiting))), "every one of them, once"
+        self.entries[begun:] = [waiting[number] for number in order]
 
     def _begun(self) -> int:
         """How many entries are running: the first, or none."""

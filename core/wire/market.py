@@ -69,10 +69,12 @@ class Breakdown(Document):
     work_s: Seconds = 0.0
     charge_s: Seconds = 0.0
     refill_s: Seconds = 0.0
+    delay_s: Seconds = 0.0
+    """What others wait longer, added up: each task behind it in the queue, and whatever is asked for next."""
 
 
 class Bid(Document):
-    """A robot's answer: seconds until the task would be done, or None with the reason."""
+    """A robot's answer: the seconds that are waited for it, or None with the reason. All but `delay_s`: until it is done."""
 
     task_id: Identifier
     robot_id: Identifier

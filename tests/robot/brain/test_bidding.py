@@ -11,6 +11,7 @@ from core.allocation.bidding import (
     Condition,
     Stop,
     charge_s,
+    done_s,
     insertion,
     price,
     refill_s,
@@ -92,19 +93,28 @@ def test_an_errand_that_began_costs_what_it_was_said_to_cost_on_the_way(where):
     begun = price(asked(), replace(thirsty, current=Stop(dock="", refill=True)))
     assert before.breakdown.refill_s > 0.0
     assert begun.breakdown.refill_s == 0.0
-    assert begun.cost_s == pytest.approx(before.cost_s)
+    assert done_s(begun.breakdown) == pytest.approx(done_s(before.breakdown))
 
 
-def test_a_task_goes_where_it_adds_least_and_costs_until_all_is_done():
-    far = Stop(dock="far", work_s=30.0, task_id="far:1")
-    busy = replace(ME, queue=(far,))
+def test_a_bid_is_the_seconds_until_it_is_done_and_those_that_all_behind_it_wait_longer():
+    busy = replace(ME, queue=(Stop(dock="far", work_s=30.0, task_id="far:1"),))
     assert insertion(asked("near"), busy) == 0
     bid = price(asked("near"), busy)
-    by_hand_s = (10.0 + DOCKING_S) + work_s("water", 150.0) + (UNDOCKING_S + 30.0 + DOCKING_S) + 30.0
-    assert bid.cost_s == pytest.approx(by_hand_s)
+    own_s = (10.0 + DOCKING_S) + work_s("water", 150.0)
+    later_s = own_s + (UNDOCKING_S + 30.0 + DOCKING_S) - (40.0 + DOCKING_S)
+    assert done_s(bid.breakdown) == pytest.approx(own_s)
+    assert bid.breakdown.delay_s == pytest.approx(2 * later_s), "the task behind it, and whoever asks next"
     assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
-    assert bid.breakdown.queue_s == pytest.approx(40.0 + DOCKING_S + 30.0)
-    near = Stop(dock="near", work_s=30.0, task_id="near:0")
+
+
+def test_a_free_robot_is_kept_from_whoever_asks_next():
+    bid = price(asked(), ME)
+    assert bid.breakdown.delay_s == pytest.approx(done_s(bid.breakdown))
+
+
+def test_a_task_goes_where_everybody_together_waits_least():
+    far, near = Stop(dock="far", work_s=30.0, task_id="far:1"), Stop(dock="near", work_s=30.0, task_id="near:0")
+    assert insertion(asked("near"), replace(ME, queue=(far,))) == 0
     assert insertion(asked("far", task_id="far:1"), replace(ME, queue=(near,))) == 1
 
 
@@ -112,7 +122,7 @@ def test_nothing_overtakes_what_is_settled_or_more_urgent_and_the_urgent_overtak
     far, settled = Stop(dock="far", work_s=30.0), Stop(dock="far", work_s=30.0, settled=True)
     assert insertion(asked("near"), replace(ME, queue=(settled,))) == 1
     near = Stop(dock="near", work_s=30.0)
-    assert insertion(asked("spare"), replace(ME, queue=(far, near))) == 1
+    assert insertion(asked("spare"), replace(ME, queue=(far, near))) == 0
     assert insertion(asked("spare"), replace(ME, queue=(far, settled, near))) == 2
     assert insertion(asked("near"), replace(ME, queue=(replace(far, priority=7),))) == 1
     urgent = asked("far").model_copy(update={"priority": 9})
@@ -121,7 +131,9 @@ def test_nothing_overtakes_what_is_settled_or_more_urgent_and_the_urgent_overtak
 
 def test_a_task_that_is_held_is_priced_where_it_stands():
     near, far = Stop(dock="near", work_s=30.0, task_id="near:1"), Stop(dock="far", work_s=30.0, task_id="far:1")
-    assert price(asked("near"), replace(ME, queue=(near, far))).cost_s == price(asked("near"), ME).cost_s
+    held, free = price(asked("near"), replace(ME, queue=(near, far))), price(asked("near"), replace(ME, queue=(far,)))
+    assert held == free
+    assert done_s(held.breakdown) == done_s(price(asked("near"), ME).breakdown)
     assert insertion(asked("near"), replace(ME, queue=(far, near))) == 1
 
 
@@ -141,25 +153,22 @@ def test_water_promised_to_earlier_tasks_is_not_there_for_later_ones():
     thirsty = replace(ME, tank_ml=200.0, queue=(Stop(dock="far", work_s=1.0, dose_ml=150.0),))
     bid = price(asked(), thirsty)
     assert insertion(asked(), thirsty) == 0
-    assert bid.breakdown.refill_s == pytest.approx(UNDOCKING_S + 10.0 + DOCKING_S + refill_s(50.0))
+    assert bid.breakdown.refill_s == 0.0
+    assert bid.breakdown.delay_s > 2 * (UNDOCKING_S + 10.0 + DOCKING_S + refill_s(50.0)), "the other has to fetch its water"
     assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
     settled = replace(thirsty, queue=(replace(thirsty.queue[0], settled=True),))
     assert price(asked(), settled).breakdown.refill_s == pytest.approx(UNDOCKING_S + 20.0 + DOCKING_S + refill_s(50.0))
     assert price(asked(), replace(ME, tank_ml=200.0)).breakdown.refill_s == 0.0
 
 
-def test_a_way_to_the_tap_that_shortens_the_ways_of_others_is_no_negative_way():
+def test_a_way_to_the_tap_that_shortens_the_ways_of_others_delays_nobody_less_than_nothing():
     dry, wet = (
         Stop(dock="far", work_s=1.0, task_id="far:1"),
-        Stop(dock="spare", work_s=1.0, dose_ml=150.0, task_id="spare:1"),
+        Stop(dock="spare", work_s=1.0, dose_ml=500.0, task_id="spare:1"),
     )
     thirsty = replace(ME, tank_ml=100.0, queue=(dry, wet))
-    bid = price(asked(plant="tap", task_id="tap:1"), thirsty)
-    assert insertion(asked(plant="tap", task_id="tap:1"), thirsty) == 0
-    assert bid.breakdown.travel_s == 0.0
-    to_the_tap_s = 20.0 + DOCKING_S + refill_s(100.0)
-    others_s = (UNDOCKING_S + 20.0 + DOCKING_S) + (UNDOCKING_S + 10.0 + DOCKING_S) + 2.0
-    assert bid.cost_s == pytest.approx(to_the_tap_s + work_s("water", 150.0) + others_s)
+    bid = price(asked(plant="tap", dose_ml=1.0, task_id="tap:1"), thirsty)
+    assert bid.breakdown.delay_s >= 0.0
     assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
 
 

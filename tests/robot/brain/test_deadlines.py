@@ -6,7 +6,7 @@ from dataclasses import replace
 from standin import in_garden
 from test_bidding import ME, asked
 
-from core.allocation.bidding import Stop, insertion, price, work_s
+from core.allocation.bidding import Stop, done_s, insertion, price, work_s
 from core.allocation.deadlines import offer, place
 
 NEAR, FAR = asked("near", task_id="near:1"), asked("far", task_id="far:1")
@@ -33,13 +33,13 @@ def test_a_task_that_can_be_done_in_time_costs_what_it_costs():
 
 def test_a_robot_that_would_be_late_says_by_how_much():
     bid = offer(due(FAR, 60.0), ME)
-    done_s = price(FAR, ME).cost_s
+    would_s = done_s(price(FAR, ME).breakdown)
     assert bid.cost_s is None
-    assert bid.reason == f"done in {done_s:.0f} s, the deadline is in 60 s"
+    assert bid.reason == f"done in {would_s:.0f} s, the deadline is in 60 s"
 
 
 def test_a_near_deadline_goes_before_what_is_equally_urgent_but_not_before_what_is_more():
-    task = due(FAR, price(FAR, ME).cost_s + 5.0)
+    task = due(FAR, done_s(price(FAR, ME).breakdown) + 5.0)
     busy = replace(ME, queue=(stop(NEAR),))
     assert place(FAR, busy) == 1, "where it adds least"
     assert place(task, busy) == 0
@@ -50,7 +50,7 @@ def test_a_near_deadline_goes_before_what_is_equally_urgent_but_not_before_what_
 
 def test_no_other_task_makes_a_promised_one_late():
     busy = replace(ME, queue=(stop(FAR),))
-    alone_s = price(FAR, ME).cost_s
+    alone_s = done_s(price(FAR, ME).breakdown)
     assert place(NEAR, busy) == 0, "on the way it adds least"
     assert place(NEAR, busy, [due(FAR, alone_s + 5.0)]) == 1
     assert place(NEAR, busy, [due(FAR, alone_s + 100.0)]) == 0
@@ -87,7 +87,7 @@ def test_no_promise_is_broken_in_any_queue():
         for task in promised:
             at = next(i for i, s in enumerate(me.queue) if s.task_id == task.task_id)
             fixed = tuple(replace(s, settled=True) for s in me.queue[:at])
-            assert price(task, replace(me, queue=fixed)).cost_s <= task.within_s
+            assert done_s(price(task, replace(me, queue=fixed)).breakdown) <= task.within_s
     assert taken > 700
     assert late > 100
 

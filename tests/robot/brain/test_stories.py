@@ -3,6 +3,7 @@
 import pytest
 from standin import in_garden
 
+from core.allocation.bidding import done_s
 from core.geometry.planar import distance_m
 from core.robots import gardener
 from core.wire.market import ReservationRequest
@@ -24,7 +25,7 @@ def test_an_awarded_watering_is_driven_docked_poured_and_reported():
         assert plant.ended.state == "done"
         assert plant.ended.delivered_ml == pytest.approx(150.0, abs=0.5)
         assert poured(garden, "plant-1") == pytest.approx(150.0, abs=0.5)
-        assert bid.cost_s == pytest.approx(took_s, rel=0.5)
+        assert done_s(bid.breakdown) == pytest.approx(took_s, rel=0.5)
         phases = [r.phase.partition(":")[0] for r in plant.reports]
         assert [p for p in ("navigate", "dock", "act") if p in phases] == ["navigate", "dock", "act"]
 
