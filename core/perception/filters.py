@@ -333,9 +333,10 @@ _SHARES = (np.arange(BINS)[:, None] / np.maximum(np.arange(BINS), 1)).astype(np.
 def areas(plane: Floats, smooth: Floats) -> Floats:
     """1 on blobs of smooth fruit colour whose area lies between the least and the largest."""
     height, width = plane.shape
-    small = cv2.resize(plane * smooth, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats((small > BLOB_FROM).astype(np.uint8), connectivity=4)
-    share = stats[:, cv2.CC_STAT_AREA] / labels.size
+    small = np.empty((height // 2, width // 2), np.uint8)
+    kernels.blobs(plane, smooth, BLOB_FROM, small)
+    _, labels = cv2.connectedComponents(small, connectivity=4)
+    share = np.bincount(labels.ravel()) / labels.size
     wanted = ((share >= AREA_MIN) & (share <= AREA_MAX)).astype(np.float32)
     wanted[0] = 0
     return np.asarray(cv2.resize(wanted[labels], (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
