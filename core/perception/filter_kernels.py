@@ -59,7 +59,7 @@ def packed(planes: Floats, smooth: Floats, spots: Floats, red_blobs: Floats, gre
 
 @njit(cache=True, fastmath=True)
 def blobs(plane: Floats, smooth: Floats, least: float, out: Bytes) -> None:
-    """1 where the product of two maps (h, w), averaged over two by two pixels, is above `least`, else 0; `out` (h/2, w/2)."""
+    """1 where the product of two maps (h, w), averaged two by two, is above `least`, else 0; `out` (h/2, w/2)."""
     quarter, least32 = np.float32(0.25), np.float32(least)
     for y in range(out.shape[0]):
         a, b, c, d = plane[2 * y], plane[2 * y + 1], smooth[2 * y], smooth[2 * y + 1]
