@@ -16,6 +16,7 @@ GardenError
 ├── DriverError (502)         a device answered, but not as its protocol says
 │   └── DriverTimeout (504)
 ├── Refused (409)             the safety gate or a market rule said no
+│   └── Overtaken             a bid holds no more: other tasks were taken since
 └── StorageError (507)        a document could not be made durable
 
 Services turn them into RFC 9457 problem documents in one handler (`core.mesh.chassis`).
@@ -111,6 +112,12 @@ class Refused(GardenError):
 
     status = 409
     title = "Refused"
+
+
+class Overtaken(Refused):
+    """An award came for a bid that other awards have made too cheap; the plant asks again."""
+
+    title = "Overtaken"
 
 
 class StorageError(GardenError):

@@ -19,7 +19,7 @@ from core.allocation.plant_side import Market
 from core.allocation.plant_state import Effect, Grant, Kill, Rules, Solicit
 from core.allocation.queue import Entry, TaskQueue
 from core.allocation.reorder import better_order
-from core.errors import Refused
+from core.errors import Overtaken, Refused
 from core.wire.geometry import Point3, Pose2
 from core.wire.market import Announcement, Award, Bid, PlantCard, Report, TaskKind
 from robot_service.brain import OVERTAKEN_FOR_S
@@ -93,16 +93,18 @@ class Outcome:
     makespan_s: float
     moves: int
     """Tasks that were taken away from one robot and given to another."""
+    declines: int
+    """Awards that were not taken."""
     messages: int
     award_s: list[float]
-    """From each wish to its first award."""
+    """From each wish until a robot has taken it."""
 
 
 class Crowd:
-    """Runs one instance to its end. `bid` prices a task."""
+    """Runs one instance to its end. `bid` prices a task; all plants ask within `together_s`."""
 
-    def __init__(self, instance: Instance, rng: Random, bid: Price = price) -> None:
-        self._instance, self._rng, self._bid = instance, rng, bid
+    def __init__(self, instance: Instance, rng: Random, bid: Price = price, together_s: float = TOGETHER_S) -> None:
+        self._instance, self._rng, self._bid, self._together_s = instance, rng, bid, together_s
         self._plants = [self._market(n) for n in range(len(instance.plants))]
         self._docks = {f"plant-{number}": at for number, at in enumerate(instance.plants)}
         self._workers = {f"robot-{n:03}": Worker(f"robot-{n:03}", at) for n, at in enumerate(instance.starts)}
@@ -111,7 +113,7 @@ class Crowd:
         self.now_s = 0.0
         self._ticks = [math.inf] * len(self._plants)
         self._asked_s = [math.inf] * len(self._plants)
-        self._out = Outcome([], [], 0.0, 0, 0, [])
+        self._out = Outcome([], [], 0.0, 0, 0, 0, [])
 
     def _market(self, number: int) -> Market:
         x_m, y_m = self._instance.plants[number]
@@ -123,7 +125,7 @@ class Crowd:
 
     def run(self) -> Outcome:
         for number in range(len(self._plants)):
-            self._later(self._rng.uniform(0.0, TOGETHER_S), lambda n=number: self._wish(n))  # type: ignore[misc]
+            self._later(self._rng.uniform(0.0, self._together_s), lambda n=number: self._wish(n))  # type: ignore[misc]
         while self._heap:
             self.now_s, _, call = heapq.heappop(self._heap)
             call()
@@ -171,9 +173,6 @@ class Crowd:
                 for robot_id in effect.robots:
                     self._word(lambda r=robot_id: self._asked(number, effect, self._workers[r]))  # type: ignore[misc]
             case Grant():
-                if self._asked_s[number] < math.inf:
-                    self._out.award_s.append(self.now_s - self._asked_s[number])
-                    self._asked_s[number] = math.inf
                 self._word(lambda: self._awarded(number, effect.award, self._workers[effect.robot_id]))
             case Kill():
                 self._word(lambda: self._killed(effect, self._workers[effect.robot_id]))
@@ -189,17 +188,30 @@ class Crowd:
         self._carry_out(number)
 
     def _awarded(self, number: int, award: Award, worker: Worker) -> None:
-        refused = ""
+        refused, overtaken = "", False
         try:
+            self._check_price(award, worker)
             worker.queue.award(award, self.now_s, insertion(award.announcement, self.condition(worker)))
             worker.queue.arrange(better_order(self.condition(worker)))
+            if self._asked_s[number] < math.inf:
+                self._out.award_s.append(self.now_s - self._asked_s[number])
+                self._asked_s[number] = math.inf
         except Refused as error:
-            refused = str(error)
-        self._word(lambda: self._answered(number, award, refused))
+            refused, overtaken = str(error), isinstance(error, Overtaken)
+            self._out.declines += 1
+        self._word(lambda: self._answered(number, award, refused, overtaken))
         self._begin(worker)
 
-    def _answered(self, number: int, award: Award, refused: str) -> None:
-        self._plants[number].award_answered(award.announcement.task_id, award.epoch, refused, self.now_s)
+    def _check_price(self, award: Award, worker: Worker) -> None:
+        if award.at_most_s is None:
+            return
+        bid = self._bid(award.announcement, self.condition(worker))
+        if bid.cost_s is None or bid.cost_s > award.at_most_s:
+            raise Overtaken("another was taken since")
+
+    def _answered(self, number: int, award: Award, refused: str, overtaken: bool) -> None:
+        task_id = award.announcement.task_id
+        self._plants[number].award_answered(task_id, award.epoch, refused, self.now_s, overtaken=overtaken)
         self._carry_out(number)
 
     def _killed(self, kill: Kill, worker: Worker) -> None:

@@ -13,7 +13,7 @@ from core.allocation.auction import no_bid
 from core.allocation.plant_side import Market
 from core.allocation.plant_state import Effect, Grant, Kill, MarketDocument, Note, Solicit
 from core.clock import Clock
-from core.errors import GardenError, PeerDown, StorageError
+from core.errors import GardenError, Overtaken, PeerDown, StorageError
 from core.mesh.client import Answer, Mesh
 from core.mesh.peers import Peers
 from core.wire.documents import Problem
@@ -122,7 +122,8 @@ class Marketplace:
         if answer is None or answer.status >= 500:
             return
         refused = "" if answer.status < 300 else _reason(answer)
-        self._keeper.machine.award_answered(task_id, epoch, refused, self._clock.now())
+        overtaken = answer.status == Overtaken.status and _problem(answer).title == Overtaken.title
+        self._keeper.machine.award_answered(task_id, epoch, refused, self._clock.now(), overtaken=overtaken)
         self._wake.set()
 
     async def _kill(self, kill: Kill) -> None:
@@ -146,7 +147,12 @@ def _silence(error: GardenError) -> str:
 
 
 def _reason(answer: Answer) -> str:
+    return _problem(answer).detail[:300]
+
+
+def _problem(answer: Answer) -> Problem:
+    """What a refusal says; a made-up one when it says nothing that we understand."""
     try:
-        return Problem.model_validate_json(answer.body).detail[:300]
+        return Problem.model_validate_json(answer.body)
     except ValueError:
-        return f"status {answer.status}"
+        return Problem(title="", status=answer.status, detail=f"status {answer.status}")

@@ -14,7 +14,7 @@ from core.allocation.epochs import owner_of
 from core.allocation.queue import Entry, TaskQueue
 from core.allocation.reorder import better_order
 from core.clock import Clock
-from core.errors import Forbidden, Refused, Unavailable, Unprocessable
+from core.errors import Forbidden, Overtaken, Refused, Unavailable, Unprocessable
 from core.geometry.pinhole import from_fov
 from core.mesh.auth import Caller, Identity, Verifier
 from core.mesh.client import Mesh, PeerTransport
@@ -245,13 +245,14 @@ class Brain:
         return now_s - max(self.scheduler.began_s, where.docked_s) if where.docked_at == running.plant_id else 0.0
 
     def award(self, award: Award, caller: Caller) -> QueuedTask:
-        """Take a task; raises Forbidden for another plant's, Refused for a stale epoch."""
+        """Take a task; raises Forbidden for another plant's, Refused for a stale epoch, Overtaken for too low a price."""
         plant_id = award.announcement.plant.plant_id
         check_owner(award.announcement, caller)
         if self.robot.peers.find(plant_id) is None or self.settings.map.dock(plant_id) is None:
             raise Unprocessable(f"{plant_id} is not a plant we know")
         if award.announcement.kind not in self._can():
             raise Unprocessable(f"cannot {award.announcement.kind}")
+        self._check_price(award)
         at = deadlines.place(award.announcement, self.condition(), self._promised())
         entry = self.queue.award(award, self.clock.now(), at)
         self._shorten_queue()
@@ -259,6 +260,15 @@ class Brain:
         self.scheduler.changed()
         self.reporter.soon()
         return queued(entry)
+
+    def _check_price(self, award: Award) -> None:
+        """Raises Overtaken when so much was taken since the bid that another robot would be the better one."""
+        if award.at_most_s is None or self.queue.find(award.announcement.task_id) is not None:
+            return
+        bid = deadlines.offer(award.announcement, self.condition(), self._promised())
+        if bid.cost_s is None or bid.cost_s > award.at_most_s:
+            now = bid.reason if bid.cost_s is None else f"{bid.cost_s:.0f} s by now"
+            raise Overtaken(f"bid {award.cost_s:.0f} s, {now}", hint="ask all robots again")
 
     def _shorten_queue(self) -> None:
         """Put what waits in a better order; what has a deadline keeps its place."""

@@ -49,6 +49,16 @@ def cheapest(bids: Iterable[Bid]) -> Bid | None:
     return min(able, key=lambda bid: (bid.cost_s, bid.robot_id), default=None)
 
 
+def worth_s(bids: Iterable[Bid], winner: Bid, margin_ratio: float) -> float | None:
+    """Up to what price the winner stays the one to have: the next cheapest bid, at least a margin above its own.
+
+    None when nobody else can.
+    """
+    if (next_best := cheapest(bid for bid in bids if bid.robot_id != winner.robot_id)) is None:
+        return None
+    return max(next_best.cost_s or 0.0, (winner.cost_s or 0.0) * (1.0 + margin_ratio))
+
+
 def better_than_holder(bids: Iterable[Bid], holder: str, margin_ratio: float) -> Bid | None:
     """The bid a task should move to: cheaper than the holder's own by more than the margin, or any when it cannot any more.
 

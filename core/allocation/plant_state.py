@@ -32,6 +32,10 @@ class Rules:
     margin_ratio: float = REALLOCATE_MARGIN_RATIO
     moves_max: int = 1
     """How often a task moves for a better price before it ends or its holder fails."""
+    declines_max: int = 6
+    """How often robots may decline an award in a row because others were quicker; then one takes it at any price."""
+    decline_s: float = 0.05
+    """After the first decline the plant asks again about so much later, after each further one twice as much."""
     permit_valid_s: float = permits.PERMIT_VALID_S
     backoff_s_min: float = 1.0
     backoff_s_max: float = 30.0
@@ -130,6 +134,10 @@ class Live:
     cost_s: float = 0.0
     running_since_s: float = math.inf
     round: Round | None = None
+    at_most_s: float | None = None
+    """Above this price the holder of an award declines it."""
+    declines: int = 0
+    """How often that happened in a row."""
     moves: int = 0
     """How often it went to a better price since it was last announced."""
     silent: bool = False

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import Any, Literal
+from zlib import crc32
 
-from core.allocation.auction import Round, better_than_holder, cheapest, told
+from core.allocation.auction import Round, better_than_holder, cheapest, told, worth_s
 from core.allocation.epochs import Names, owner_of
 from core.allocation.plant_state import Effect, Grant, Kill, Live, MarketDocument, Note, Rules, Solicit
 from core.errors import NotFound
@@ -102,13 +103,18 @@ class TaskBook:
         if live.round.complete:
             self._close_round(self._tasks[task_id], live.round, now_s)
 
-    def award_answered(self, task_id: str, epoch: int, refused: str, now_s: float) -> None:
-        """The robot took the award, or refused it and why. One that did not answer is asked again by `tick`."""
+    def award_answered(self, task_id: str, epoch: int, refused: str, now_s: float, *, overtaken: bool = False) -> None:
+        """The robot took the award, or refused it and why. One that did not answer is asked again by `tick`.
+
+        `overtaken`: its bid holds no more, so all are asked again at once. That is nobody's failure.
+        """
         task, live = self._tasks.get(task_id), self._live.get(task_id)
         if task is None or live is None or task.epoch != epoch or task.state not in ("awarded", "running"):
             return
         live.resend_s = math.inf
-        if refused and task.state == "awarded":
+        if overtaken and task.state == "awarded":
+            self._declined(task, live, refused, now_s)
+        elif refused and task.state == "awarded":
             self._release(task, f"{task.robot_id} refused the award: {refused}", now_s, failed=True)
 
     # Events: time
@@ -225,12 +231,17 @@ class TaskBook:
         live.resend_s = now_s + self.rules.resend_s
         live.running_since_s = math.inf
         live.cost_s = cost_s
+        winner = next(bid for bid in bids if bid.robot_id == robot_id)
+        patient = live.declines < self.rules.declines_max
+        live.at_most_s = worth_s(bids, winner, self.rules.margin_ratio) if patient else None
         self._event(task, f"awarded to {robot_id}, epoch {task.epoch}: {why}", now_s)
         self._effects.append(self._grant(task, cost_s, now_s))
 
     def _grant(self, task: Task, cost_s: float, now_s: float) -> Grant:
         asked = self._announcement(task, now_s)
-        return Grant(task.robot_id, Award(announcement=asked, epoch=task.epoch, lease_s=self.rules.lease_s, cost_s=cost_s))
+        at_most_s, lease_s = self._live[task.task_id].at_most_s, self.rules.lease_s
+        award = Award(announcement=asked, epoch=task.epoch, lease_s=lease_s, cost_s=cost_s, at_most_s=at_most_s)
+        return Grant(task.robot_id, award)
 
     def _announcement(self, task: Task, now_s: float) -> Announcement:
         within_s = None if task.deadline_s is None else max(0.0, task.deadline_s - now_s)
@@ -252,6 +263,15 @@ class TaskBook:
         self._live[task.task_id] = Live(next_ask_s=now_s + wait_s, backoff_s=wait_s)
         task = self._put(task, now_s, state="announced", robot_id="", phase="", progress=0.0, reason=why[:500])
         self._event(task, why, now_s)
+
+    def _declined(self, task: Task, live: Live, why: str, now_s: float) -> None:
+        """Ask again, at a moment of its own: of many plants that were declined, not all again at once."""
+        spread = 0.5 + crc32(f"{task.task_id} {task.epoch}".encode()) / 2**32
+        next_ask_s = now_s + spread * self.rules.decline_s * 2**live.declines
+        self._live[task.task_id] = Live(next_ask_s=next_ask_s, declines=live.declines + 1, moves=live.moves)
+        told = f"{task.robot_id} declined the award: {why}"[:500]
+        task = self._put(task, now_s, state="announced", robot_id="", reason=told)
+        self._event(task, told, now_s)
 
     def _kill(self, task: Task) -> None:
         if task.robot_id:

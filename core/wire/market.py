@@ -90,6 +90,8 @@ class Award(Document):
     epoch: Epoch
     lease_s: Seconds
     cost_s: Seconds
+    at_most_s: Seconds | None = None
+    """A robot that would bid more than this by now declines (409, "Overtaken"); null: it takes the task anyway."""
 
 
 class Report(Document):

@@ -7,6 +7,7 @@ import math
 from collections import defaultdict, deque
 from dataclasses import dataclass
 
+from core.errors import Overtaken
 from core.mesh.client import Answer
 from core.wire.market import BID_WINDOW_S, Bid, BidRound, Task
 from lab.soak.case import Case
@@ -45,6 +46,12 @@ class Awards:
         holder = self._case.awards.setdefault((task_id, epoch), message.target)
         if holder != message.target:
             self._case.breach("I1", f"{task_id} epoch {epoch} was awarded to {holder} and to {message.target}")
+
+    def refused(self, message: Message, answer: Answer) -> None:
+        """A robot did not take an award."""
+        if message.target.startswith("robot") and json.loads(answer.body)["title"] == Overtaken.title:
+            award = json.loads(message.body)
+            self._case.declined.add((award["announcement"]["task_id"], award["epoch"]))
 
     def asked(self, message: Message) -> None:
         """A robot is asked for a bid."""

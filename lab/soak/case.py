@@ -64,6 +64,8 @@ class Case:
         self.permits: dict[str, Given] = {}
         self.awards: dict[tuple[str, int], str] = {}
         """The robot that a task was awarded to, by task and epoch."""
+        self.declined: set[tuple[str, int]] = set()
+        """Awards that a robot declined because its bid held no more, by task and epoch: they changed no hands."""
         self.stopped: set[str] = set()
         """Robots whose e-stop was confirmed and not released since."""
 

@@ -93,6 +93,8 @@ class Judge:
     def _refused(self, message: Message, answer: Answer) -> None:
         """I4: no 500. I7: no node fails to understand another."""
         route = f"{message.method} {message.path.partition('?')[0]}"
+        if route == "POST /tasks" and answer.status == 409:
+            self.awards.refused(message, answer)
         if answer.status == 500:
             self._case.breach("I4", f"{message.target} answered 500 to {route}")
         if answer.status in (400, 405, 422) and message.source != "operator":

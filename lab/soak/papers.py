@@ -120,14 +120,17 @@ class Papers:
         (self._open[plant_id].discard if task.state in FINAL_STATES else self._open[plant_id].add)(task.task_id)
 
     def _changed_hands(self, plant_id: str, task: Task, seen: _Seen) -> None:
-        """I6: awarded once, once more for a better price, and once more for every fault that met it."""
+        """I6: taken once, once more for a better price, and once more for every fault that met it."""
+        case = self._case
         if task.epoch <= seen.epoch:
             return
         if self._lasting(plant_id):
             seen.faults_before -= task.epoch - seen.epoch
         faults = self._faults(plant_id, task.task_id) - seen.faults_before
-        if task.epoch - 1 > 1 + faults:
-            self._case.breach("I6", f"{task.task_id} is at epoch {task.epoch} with {faults} faults about it")
+        declined = sum(task_id == task.task_id for task_id, _ in case.declined)
+        if task.epoch - 1 > 1 + faults + declined:
+            told = f"{faults} faults about it and {declined} awards declined"
+            case.breach("I6", f"{task.task_id} is at epoch {task.epoch} with {told}")
 
     def _faults(self, plant_id: str, task_id: str) -> int:
         """Those that met its plant, the station, any robot, or a message about it, its dock or where a robot is."""

@@ -31,6 +31,18 @@ def test_every_plant_of_a_crowd_is_served_once_and_the_seconds_add_up():
     assert max(served.award_s) < 0.1
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_burst_is_shared_out_as_well_as_wishes_that_come_one_after_another(seed):
+    print("seed", seed)
+    instance = Instance.drawn(4, 20, Random(seed))
+    spread = Crowd(instance, Random(seed), together_s=20.0).run()
+    burst = Crowd(instance, Random(seed), together_s=0.0).run()
+    assert burst.declines > 0
+    assert burst.makespan_s <= 1.15 * spread.makespan_s
+    assert sum(burst.busy_s) <= 1.1 * sum(spread.busy_s)
+    assert max(burst.award_s) < 3.0
+
+
 def test_a_crowd_is_a_function_of_its_seed():
     assert outcome(2, 6)[1] == outcome(2, 6)[1]
 

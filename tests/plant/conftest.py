@@ -71,6 +71,8 @@ class Robot:
         self.work_s, self.start_s = 10.0, 1.0
         self.down = False
         self.refuse_awards = ""
+        self.overtaken = False
+        """Whether it declines awards because others were quicker."""
         self.die_after_act = False
         self.die_before_act = False
         self.lose_done = 0
@@ -101,6 +103,8 @@ class Robot:
 
     def _awarded(self, award: Award) -> Answer:
         task_id = award.announcement.task_id
+        if self.overtaken and award.at_most_s is not None:
+            return Answer(409, json.dumps({"title": "Overtaken", "status": 409, "detail": "90 s by now"}).encode())
         if self.refuse_awards:
             problem = {"title": "Refused", "status": 409, "detail": self.refuse_awards}
             return Answer(409, json.dumps(problem).encode())

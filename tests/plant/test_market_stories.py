@@ -167,6 +167,23 @@ def test_a_refused_award_goes_to_the_market_again(play: Play) -> None:
     play(story)
 
 
+def test_an_award_that_is_declined_goes_to_the_next_at_once(play: Play) -> None:
+    async def story(garden: Garden) -> None:
+        one, two = garden.robot("robot-1", 5.0), garden.robot("robot-2", 50.0)
+        one.overtaken = True
+        one.cost = lambda _: 5.0 if one.asked < 2 else 90.0
+        garden.pot(ratio=0.19)
+        done = await garden.until_task("done")
+        assert (done["robot_id"], done["epoch"]) == ("robot-2", 2)
+        told = {event["what"]: event["t_s"] for event in done["events"]}
+        declined_s = told["robot-1 declined the award: 90 s by now"]
+        awarded_s = next(t_s for what, t_s in told.items() if what.startswith("awarded to robot-2"))
+        assert awarded_s - declined_s < 0.5
+        assert two.poured_ml == 150.0
+
+    play(story)
+
+
 def test_an_operators_cancel_kills_the_robots_job(play: Play) -> None:
     async def story(garden: Garden) -> None:
         one = garden.robot("robot-1", 5.0)

@@ -111,6 +111,21 @@ def test_bids_come_within_a_few_milliseconds_of_work():
     asked(story)
 
 
+def test_an_award_for_more_than_it_is_worth_by_now_is_declined_unless_it_is_held_already():
+    async def story(garden):
+        bid_s = (await garden.bid("plant-1")).cost_s
+        award = garden.award_of("plant-1").model_copy(update={"at_most_s": 1.2 * bid_s})
+        assert (await garden.award("plant-2")).status_code == 201
+        declined = await garden.call("robot-1", "POST", "/tasks", award, as_="plant-1")
+        assert (declined.status_code, declined.json()["title"]) == (409, "Overtaken")
+        assert [entry.plant_id for entry in garden.brains["robot-1"].queue.entries] == ["plant-2"]
+        anyway = award.model_copy(update={"at_most_s": None})
+        assert (await garden.call("robot-1", "POST", "/tasks", anyway, as_="plant-1")).status_code == 201
+        assert (await garden.call("robot-1", "POST", "/tasks", award, as_="plant-1")).status_code == 201
+
+    asked(story)
+
+
 def test_a_plant_that_nobody_enrolled_gets_no_bid():
     async def story(garden):
         ask = garden.plants["plant-1"].announcement()
