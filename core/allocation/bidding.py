@@ -316,11 +316,12 @@ def _inserted(asked: Announcement, route: _Route, index: int, current_s: float) 
     own = _own(asked, walk)
     if isinstance(own, str):
         return own
-    later_s = route.later_s(walk, before_s + sum(own), index)
+    refill, charging, travel, work = own
+    later_s = route.later_s(walk, before_s + refill + charging + travel + work, index)
     if later_s is None:
         return "no way to what is later in the queue"
     put_off = len(route.queue) - index + 1
-    return own._replace(current_s=current_s, queue_s=before_s, delay_s=put_off * later_s)
+    return _Parts(current_s, before_s, travel, work, charging, refill, put_off * later_s)
 
 
 def _unable(asked: Announcement, me: Condition) -> str:
@@ -342,8 +343,8 @@ def _unable(asked: Announcement, me: Condition) -> str:
     return ""
 
 
-def _own(asked: Announcement, walk: _Walk) -> _Parts | str:
-    """What the task itself takes: refill and charge where needed, then the way and the work; or why it cannot be."""
+def _own(asked: Announcement, walk: _Walk) -> tuple[float, float, float, float] | str:
+    """What the task itself takes: refill and charge where needed, then the way and the work [s]; or why it cannot be."""
     if (water_s := walk.drink(asked.dose_ml)) is None:
         return f"the tank holds {walk.tank_ml:.0f} ml and no tap can be reached"
     charging_s = 0.0
@@ -357,8 +358,7 @@ def _own(asked: Announcement, walk: _Walk) -> _Parts | str:
     if travel_s is None:
         return f"no way to the dock of {asked.plant.plant_id}"
     walk.tank_ml -= asked.dose_ml
-    work = work_s(asked.kind, asked.dose_ml, asked.count)
-    return _Parts(travel_s=travel_s, work_s=work, charge_s=charging_s, refill_s=water_s)
+    return water_s, charging_s, travel_s, work_s(asked.kind, asked.dose_ml, asked.count)
 
 
 def done_s(cost: Breakdown) -> float:
