@@ -95,11 +95,17 @@ class Ground:
         path = reached.path_from((start[0], start[1]))
         return None if path is None else path.length_m
 
-    def with_others(self, discs: Iterable[Other], routes: Iterable[Sequence[Point]], me: Point | Pose) -> CSpace:
-        """Others as discs, grown by what they may have driven since, and routes as corridors. Growth never swallows `me`."""
+    def with_others(
+        self, discs: Iterable[Other], routes: Iterable[Sequence[Point]], me: Point | Pose, *, tight: bool = False
+    ) -> CSpace:
+        """Others as discs, grown by what they may have driven since, and routes as corridors. Growth never swallows `me`.
+
+        `tight`: discs where they were last heard, and not a centimetre more than nobody may come nearer.
+        """
         grid = self._grid()
         for other in discs:
-            grid.add_disc(other.x_m, other.y_m, OTHER_RADIUS_M + _growth(other, me))
+            more_m = -CLEAR_M if tight else _growth(other, me)
+            grid.add_disc(other.x_m, other.y_m, OTHER_RADIUS_M + more_m)
         for route in routes:
             for x_m, y_m in along(route):
                 grid.add_disc(x_m, y_m, OTHER_RADIUS_M)

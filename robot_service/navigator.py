@@ -12,6 +12,7 @@ from core.allocation.right_of_way import (
     RANK_DRIVING,
     ROUTE_M,
     Other,
+    along,
     goes_first,
     in_the_way_of,
     route_gap_m,
@@ -33,6 +34,8 @@ RETREAT_S = 20.0
 """Blocked this long by anybody, retreat to a refuge and try again."""
 REFUGE_REST_S = 3.0
 STUCK_S = 180.0
+NEARER_M = 0.05
+WANTED_POINTS = 1 + round(ROUTE_M / 0.25)
 CREEP_MPS = 0.02
 ZONE_M = 0.75
 
@@ -72,11 +75,18 @@ class Navigator:
     _blocked_by: str = ""
     _why: str = ""
     _held: bool = False
+    _wanted: tuple[Point, ...] = ()
+    """The way it would go were nobody in it, while there is none: whoever gives way must know what to leave free."""
+    _left_m: float = math.inf
+    _nearer_s: float = -1e9
+    """The least way that was ever left, and when it last became less."""
     replans: int = 0
 
     def route(self) -> list[Point]:
         """The next metres it means to drive, for the neighbours."""
-        if self._follower is None or self._held or self._aim == "refuge":
+        if self._follower is None:
+            return list(self._wanted)
+        if self._held or self._aim == "refuge":
             return []
         return self._follower.ahead(ROUTE_M)
 
@@ -89,18 +99,25 @@ class Navigator:
 
     def step(self, pose: Pose, now_s: float, others: Sequence[Other]) -> Going:
         if self._began_s is None or self._moved_s is None:
-            self._began_s = self._moved_s = now_s
+            self._began_s = self._moved_s = self._nearer_s = now_s
         if now_s - self._looked_s >= LOOK_S or self._off_path():
             self._looked_s = now_s
             self._look(pose, now_s, others)
-        if now_s - self._moved_s > STUCK_S:
+        self._note_progress(now_s)
+        if now_s - min(self._moved_s, self._nearer_s) > STUCK_S:
             return Going(failed=f"no progress for {STUCK_S:.0f} s: {self._why or 'the way is blocked'}")
         if self._follower is None:
             return Going(waiting=self._why or "no way to go")
         if self._held_back(pose):
-            self._moved_s = now_s
+            self._moved_s = self._nearer_s = now_s
             return Going(waiting=self._why)
         return self._follow(pose, now_s, others)
+
+    def _note_progress(self, now_s: float) -> None:
+        """Going to and fro is none."""
+        left_m = self.remaining_m()
+        if left_m is not None and left_m < self._left_m - NEARER_M:
+            self._left_m, self._nearer_s = left_m, now_s
 
     def _off_path(self) -> bool:
         return self._follower is not None and self._follower.off_path_m > OFF_PATH_M
@@ -163,6 +180,7 @@ class Navigator:
         stamp = self._stamp(yielding, firm)
         if self._aim == "goal" and stamp == self._planned and self._follower is not None and not self._off_path():
             return
+        self._wanted = ()
         path = self._way(pose, yielding, firm)
         if path is None:
             self._follower, self._planned = None, ()
@@ -180,22 +198,34 @@ class Navigator:
         """The shortest acceptable path: round everybody firm and their routes, round those who stand if that is cheap."""
         goal = (self.goal[0], self.goal[1])
         self.replans += 1
-        routes = [o.route for o in firm if o.route and not o.silent]
+        me = (self.rank, self.me)
+        routes = [o.route for o in firm if o.route and not o.silent and (o.moving or not goes_first(me, o))]
         still = [o for o in yielding if not o.moving]
         free = self.ground.path(self.ground.with_others(firm, routes, pose), pose, goal)
-        if free is None and routes:
-            free = self.ground.path(self.ground.with_others(firm, (), pose), pose, goal)
-            if free is not None and any(self._crosses(free, r) for r in routes):
-                self._why = "waits for " + ", ".join(o.robot_id for o in firm if o.route) + " to pass"
-                return None
+        if free is None and (free := self._past(pose, firm)) is not None and any(self._crosses(free, r) for r in routes):
+            self._why = "waits for " + ", ".join(o.robot_id for o in firm if o.route) + " to pass"
+            return None
         if free is None:
-            self._why = self._closed(goal, firm)
+            self._why, self._wanted = self._closed(goal, firm), self._straight(pose, goal)
             return None
         if not still:
             return free
         around = self.ground.path(self.ground.with_others([*firm, *still], routes, pose), pose, goal)
         cheap = around is not None and around.length_m <= DETOUR_RATIO * free.length_m + DETOUR_M
         return around if cheap else free
+
+    def _past(self, pose: Pose, firm: Sequence[Other]) -> Path | None:
+        """A path past those who stay, whatever they mean to drive. Who gave way may stand at the very edge of what must
+        be free, and word of it be old: speed limits see to both, so a tight way is one."""
+        goal = (self.goal[0], self.goal[1])
+        wide = self.ground.path(self.ground.with_others(firm, (), pose), pose, goal)
+        return wide or self.ground.path(self.ground.with_others(firm, (), pose, tight=True), pose, goal)
+
+    def _straight(self, pose: Pose, goal: Point) -> tuple[Point, ...]:
+        """The next metres of the way on the ground without others."""
+        field = self.ground.field_to(goal)
+        path = None if field is None else field.path_from(pose)
+        return () if path is None else tuple(along([(float(x), float(y)) for x, y in path.points_m], 0.25)[:WANTED_POINTS])
 
     def _crosses(self, path: Path, route: Sequence[Point]) -> bool:
         return any(near_route((float(x), float(y)), route) for x, y in path.points_m[1:])
@@ -208,6 +238,7 @@ class Navigator:
 
     def _flee(self, pose: Pose, others: Sequence[Other], from_all: bool = False) -> None:
         """Head for the nearest place off everybody's route; stay when there is none."""
+        self._wanted = ()
         if self._aim == "refuge" and self._follower is not None and not from_all:
             return
         me = (self.rank, self.me)

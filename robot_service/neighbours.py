@@ -11,7 +11,7 @@ from core.clock import Clock
 from core.errors import GardenError
 from core.geometry.planar import Pose, distance_m
 from core.mesh.client import Mesh
-from core.mesh.peers import Peer, Peers
+from core.mesh.peers import Peers
 from core.wire.robot import Position
 
 MOVING_EVERY_S = 1.0
@@ -19,6 +19,10 @@ NEAR_EVERY_S = 0.5
 NEAR_M = 1.6
 STILL_EVERY_S = 5.0
 IDLE_EVERY_S = 30.0
+ANSWER_S = 0.5
+"""An answer that takes longer is not waited for before the next question."""
+POLLS_MAX = 4
+"""Questions under way at once."""
 ASKED_EVERY_S = 5.0
 """Somebody who asks for our position is about to move: ask back, but not more often than this."""
 
@@ -47,23 +51,40 @@ class Neighbours:
     _stirred: asyncio.Event = field(default_factory=asyncio.Event)
 
     async def run(self) -> None:
-        while True:
-            await self.poll()
-            await self._pause()
+        """Ask again and again, for ever; a word that was lost keeps nobody from asking anew."""
+        asking: set[asyncio.Task[None]] = set()
+        async with asyncio.TaskGroup() as group:
+            while True:
+                if len(asking) < POLLS_MAX:
+                    poll = group.create_task(self.poll())
+                    asking.add(poll)
+                    poll.add_done_callback(asking.discard)
+                    await self._until_told(poll)
+                await self._pause()
+
+    async def _until_told(self, poll: asyncio.Task[None]) -> None:
+        try:
+            async with self.clock.timeout(ANSWER_S):
+                await asyncio.shield(poll)
+        except TimeoutError:
+            pass
 
     async def poll(self) -> None:
-        """Ask every 1-hop robot now."""
+        """Ask every 1-hop robot now; each answer is heard as it comes."""
         robots = [peer for peer in self.peers.one_hop() if peer.kind == "robot" and peer.id != self.me]
         if not robots:
             return
         self._asked_s = asked_s = self.clock.now()
-        answers = await self.mesh.ask_all(robots, "GET", "/position", expect=Position, each=None)
-        for peer in robots:
-            self._hear(peer, answers[peer.id], asked_s)
+        await self.mesh.ask_all(
+            robots, "GET", "/position", expect=Position, each=lambda name, answer: self._hear(name, answer, asked_s)
+        )
 
-    def _hear(self, peer: Peer, answer: Position | GardenError, asked_s: float) -> None:
-        if isinstance(answer, Position) and answer.robot_id == peer.id:
-            self.heard[peer.id] = Heard(answer, asked_s)
+    def _hear(self, name: str, answer: Position | GardenError, asked_s: float) -> None:
+        known = self.heard.get(name)
+        if known is not None and known.at_s > asked_s:
+            return
+        if isinstance(answer, Position) and answer.robot_id == name:
+            self.heard[name] = Heard(answer, asked_s)
             if answer.moving:
                 self._stirred.set()
 

@@ -76,11 +76,20 @@ def aisle_garden(long_m):
     return Scenario(arena=Arena(length_m=2 * half_m, width_m=WIDTH_M), plants=plants, robots=robots, station=station)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 9))])
-def test_robots_with_tasks_at_the_other_ends_of_an_aisle_do_them_and_change_places_again(seed):
-    """Whole brains: first from their homes, then each from the dock that the other one is awarded."""
+LOST = [pytest.param(seed, 0.2, marks=pytest.mark.soak) for seed in range(1, 7)]
+HEARD = [(1, 0.0), *(pytest.param(seed, 0.0, marks=pytest.mark.soak) for seed in range(2, 9))]
+
+
+@pytest.mark.parametrize(("seed", "loss_ratio"), [*HEARD, *LOST])
+def test_robots_with_tasks_at_the_other_ends_of_an_aisle_do_them_and_change_places_again(seed, loss_ratio):
+    """Whole brains: first from their homes, then each from the dock that the other one is awarded.
+
+    `loss_ratio` of what one robot asks the other is lost, and as much of the answers.
+    """
 
     async def story(garden):
+        for way in (("robot-1", "robot-2"), ("robot-2", "robot-1")):
+            garden.mesh.leg(*way).loss_ratio = loss_ratio
         for number, (first, second) in enumerate((("plant-east", "plant-west"), ("plant-west", "plant-east")), 1):
             plants = garden.plants[first], garden.plants[second]
             await garden.award(first, "robot-1", number, dose_ml=30.0)
