@@ -317,7 +317,7 @@ class Brain:
         return job
 
     async def stop(self, caller: Caller, reason: str) -> Stopped:
-        """Latch the e-stop in the body; answers once the body says so."""
+        """Latch the e-stop in the body; answers once the body has written it down. It stops whatever the answer."""
         began_s = self.clock.now()
         # Told again in bids, reports and reasons for waiting, which are sentences of their own.
         self.body.order("stop", f"{caller.subject}: {reason}"[:STOPPED_BY_CHARS] if reason else caller.subject)
@@ -334,11 +334,13 @@ class Brain:
     async def _until(self, *, stopped: bool) -> None:
         try:
             async with self.clock.timeout(STOP_ANSWER_S):
-                while self.body.state is None or self.body.state.stopped != stopped:
+                while self.body.state is None or (self.body.state.stopped, self.body.state.stop_kept) != (stopped, True):
                     await self.clock.sleep(0.02)
         except TimeoutError:
             order = "stop" if stopped else "resume"
-            raise Unavailable(f"the body did not confirm the {order} within {STOP_ANSWER_S:g} s") from None
+            held = self.body.state is not None and self.body.state.stopped and stopped
+            stands = "; it stands still, but a restart would forget it: look at its disk" if held else ""
+            raise Unavailable(f"the body did not confirm the {order} within {STOP_ANSWER_S:g} s{stands}") from None
 
     def _stop_state(self, began_s: float) -> Stopped:
         state = self.body.state

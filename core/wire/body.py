@@ -114,6 +114,8 @@ class BodyState:
     stopped: bool = True
     """The e-stop is latched."""
     stopped_by: str = ""
+    stop_kept: bool = True
+    """That it is latched, or is not, is written down and survives a restart."""
     refusal: str = ""
     """Why the gate refused the newest setpoint, or parts of it; empty when all was allowed."""
     down: tuple[str, ...] = ()

@@ -166,6 +166,7 @@ class BodyNode:
             permit_id=self.doser.permit_id,
             stopped=self.latch.stopped,
             stopped_by=self.latch.by,
+            stop_kept=self.latch.kept,
             refusal="" if waking else self._verdict.refusal,
             next_in_s=self._next_in_s(),
         )
@@ -229,7 +230,7 @@ class BodyNode:
     def _ordered(self, control: Control) -> None:
         """A stop acts at once; what must be written down follows in its turn."""
         if control.order == "stop":
-            self.latch.stopped, self.latch.by = True, control.by or "somebody"
+            self.latch.press(control.by)
             self.actuators.halt(self._clock.now())
         if control.order in ("rest", "wake"):
             self._kept_awake = control.order == "wake"
@@ -248,7 +249,7 @@ class BodyNode:
             control = await self._orders.get()
             try:
                 if control.order == "stop":
-                    await self.latch.latch(control.by)
+                    await self.latch.keep()
                 else:
                     await self.latch.release()
                 _log.warning("e-stop", order=control.order, by=control.by)

@@ -117,8 +117,11 @@ class StopLatch:
 
     def __init__(self, folder: Path, clock: Clock, disk: Disk | None = None) -> None:
         self._document = DurableDocument(folder / "stop.json", STOP_SCHEMA, clock, disk)
+        self._presses = 0
         self.stopped = True
         self.by = "not started yet"
+        self.kept = False
+        """As it stands it is written down."""
 
     def load(self) -> None:
         """Stand as before the restart; raises StorageError when that cannot be known."""
@@ -127,19 +130,25 @@ class StopLatch:
             stop = _Stop(stopped=False, by="") if document is None else _Stop.model_validate(document)
         except ValidationError as error:
             raise StorageError(f"{self._document.path} is no stop latch: {error}") from error
-        self.stopped, self.by = stop.stopped, stop.by
+        self.stopped, self.by, self.kept = stop.stopped, stop.by, True
 
     def close(self) -> None:
         self._document.close()
 
-    async def latch(self, by: str) -> None:
+    def press(self, by: str) -> None:
         """Stop now, whatever happens to the disk."""
-        self.stopped, self.by = True, by or "somebody"
+        self._presses += 1
+        self.stopped, self.by, self.kept = True, by or "somebody", False
+
+    async def keep(self) -> None:
+        """Write down that it is latched. Raises StorageError; then it stands, and would not survive a restart."""
+        presses = self._presses
         await self._document.save({"stopped": True, "by": self.by})
+        self.kept = self.stopped and presses == self._presses
 
     async def release(self) -> None:
         """Raises StorageError and stays latched when it cannot be made durable."""
-        by = self.by
+        presses = self._presses
         await self._document.save({"stopped": False, "by": ""})
-        if self.stopped and self.by == by:
-            self.stopped, self.by = False, ""
+        if presses == self._presses:
+            self.stopped, self.by, self.kept = False, "", True

@@ -152,6 +152,7 @@ class Senses:
         permit_id: str,
         stopped: bool,
         stopped_by: str,
+        stop_kept: bool,
         refusal: str,
         next_in_s: float,
     ) -> BodyState:
@@ -189,6 +190,7 @@ class Senses:
             marker_blind_s=round(now_s - last.stamp_s, 3) if last is not None else round(now_s, 3),
             stopped=stopped,
             stopped_by=stopped_by,
+            stop_kept=stop_kept,
             refusal=refusal,
             down=self.down(),
             next_in_s=next_in_s,

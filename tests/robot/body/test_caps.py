@@ -111,10 +111,15 @@ def test_the_latch_acts_although_the_disk_does_not(tmp_path: Path) -> None:
         assert latch.stopped
         latch.load()
         assert not latch.stopped
+        latch.press("anna")
+        await latch.keep()
+        assert latch.kept
+        await latch.release()
         latch.close()
+        latch.press("anna")
         with pytest.raises(StorageError):
-            await latch.latch("anna")
-        assert (latch.stopped, latch.by) == (True, "anna")
+            await latch.keep()
+        assert (latch.stopped, latch.by, latch.kept) == (True, "anna", False)
         with pytest.raises(StorageError):
             await latch.release()
         assert latch.stopped

@@ -96,6 +96,7 @@ class StandInBody:
         self.travel_scale, self.noise_m = 1.03, 0.006
         self.battery_ratio, self.tank_ml = 0.9, 1200.0
         self.stopped, self.stopped_by, self.blind, self.pump_stuck = False, "", False, False
+        self.disk_broken = False
         self.attracted_to = ""
         """A dock whose beams drown the others."""
         self.arm: Joints | None = None
@@ -306,6 +307,7 @@ class StandInBody:
             marker=marker,
             stopped=self.stopped,
             stopped_by=self.stopped_by,
+            stop_kept=not self.disk_broken,
         )
         try:
             self.link.write(encode(state))

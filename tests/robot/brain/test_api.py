@@ -78,6 +78,17 @@ def test_a_stale_award_is_409_and_a_repeated_one_is_the_same():
     asked(story)
 
 
+def test_an_e_stop_that_the_body_cannot_write_down_stands_and_is_not_confirmed():
+    async def story(garden):
+        garden.bodies["robot-1"].disk_broken = True
+        answer = await garden.call("robot-1", "POST", "/stop", StopRequest(reason="cat"), as_="viewer")
+        assert answer.status_code == 503
+        assert "a restart would forget it" in answer.json()["detail"]
+        assert (await garden.call("robot-1", "GET", "/state")).json()["stopped"]
+
+    asked(story)
+
+
 def test_state_position_and_history_are_open_and_whole():
     async def story(garden):
         state = (await garden.call("robot-1", "GET", "/state", as_="viewer")).json()
