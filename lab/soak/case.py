@@ -66,6 +66,8 @@ class Case:
         """The robot that a task was awarded to, by task and epoch."""
         self.declined: set[tuple[str, int]] = set()
         """Awards that a robot declined because its bid held no more, by task and epoch: they changed no hands."""
+        self.born_s: dict[str, float] = {}
+        """When a task was first seen; what it says itself is by a clock that may be gone."""
         self.stopped: set[str] = set()
         """Robots whose e-stop was confirmed and not released since."""
 

@@ -110,9 +110,10 @@ class Gremlin:
         while True:
             self.on = True
             until_s = self.truth.now() + CALM_EVERY_S - CALM_S
-            while self.truth.now() < until_s:
-                await asyncio.sleep(self.rng.expovariate(hurry / FAULT_EVERY_S))
+            while (wait_s := self.rng.expovariate(hurry / FAULT_EVERY_S)) < until_s - self.truth.now():
+                await asyncio.sleep(wait_s)
                 await self._one()
+            await asyncio.sleep(until_s - self.truth.now())
             self.heal_all()
             await asyncio.sleep(CALM_S)
 

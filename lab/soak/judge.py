@@ -28,6 +28,8 @@ class Judge:
         self._case = case = Case(truth, gremlin)
         self.acts, self.awards, self.progress = Acts(case), Awards(case), Progress(case)
         self.papers = Papers(case, self.awards.read)
+        self._stops: set[str] = set()
+        """E-stops that were confirmed: the same question gets the same answer again, also after a release."""
 
     @property
     def breaches(self) -> list[Breach]:
@@ -84,7 +86,8 @@ class Judge:
             return
         if message.path.endswith("/permits"):
             self.acts.given(message, answer)
-        if message.path == "/stop":
+        if message.path == "/stop" and message.key not in self._stops:
+            self._stops.add(message.key)
             self._case.stopped.add(message.target)
         if message.target.startswith("plant"):
             self.papers.look(message.target)

@@ -18,6 +18,8 @@ from typing import Any, TypeVar
 from core.virtual import VirtualLoop
 
 T = TypeVar("T")
+OVERTAKING = 0.3
+"""Chance that a callback runs before the one before it, if that is another process's."""
 _life: contextvars.ContextVar[Life | None] = contextvars.ContextVar("life", default=None)
 
 
@@ -52,7 +54,9 @@ class Life:
     stopped: bool = False
     """SIGSTOP: nothing of it runs."""
     held: list[asyncio.Handle] = field(default_factory=list)
-    tasks: weakref.WeakSet[asyncio.Task[Any]] = field(default_factory=weakref.WeakSet)
+    _tasks: weakref.WeakValueDictionary[int, asyncio.Task[Any]] = field(default_factory=weakref.WeakValueDictionary)
+    """In the order in which they began, so that their ends are a function of the seed."""
+    _begun: int = 0
 
     def __post_init__(self) -> None:
         self._context = contextvars.copy_context()
@@ -79,15 +83,23 @@ class Life:
         self.alive = False
         if self.stopped:
             self.go_on()
-        for task in list(self.tasks):
+        for task in list(self._tasks.values()):
+            task.cancel()
+
+    def adopt(self, task: asyncio.Task[Any]) -> None:
+        """A task of this process has begun."""
+        self._begun += 1
+        self._tasks[self._begun] = task
+        if not self.alive:
             task.cancel()
 
 
 class SoakLoop(VirtualLoop):
-    """A virtual loop that knows which process a callback belongs to."""
+    """A virtual loop that knows which process a callback belongs to, and lets processes overtake one another."""
 
-    def __init__(self) -> None:
+    def __init__(self, rng: random.Random) -> None:
         super().__init__()
+        self._rng = rng
         self.set_task_factory(_task)
 
     def _call_soon(self, callback: Any, args: Any, context: contextvars.Context | None) -> asyncio.Handle:
@@ -96,8 +108,16 @@ class SoakLoop(VirtualLoop):
         if life is not None and life.stopped:
             life.held.append(handle)
         else:
-            self._ready.append(handle)  # type: ignore[attr-defined]
+            self._line_up(handle, life)
         return handle
+
+    def _line_up(self, handle: asyncio.Handle, life: Life | None) -> None:
+        """Behind what this process has ready already, but by chance before what others have."""
+        ready = self._ready  # type: ignore[attr-defined]
+        place = len(ready)
+        while place and self._rng.random() < OVERTAKING and ready[place - 1]._context.get(_life) is not life:
+            place -= 1
+        ready.insert(place, handle)
 
     def take_back(self, handles: list[asyncio.Handle]) -> None:
         self._ready.extend(handles)  # type: ignore[attr-defined]
@@ -107,9 +127,7 @@ def _task(loop: asyncio.AbstractEventLoop, work: Any, context: contextvars.Conte
     task = asyncio.Task(work, loop=loop, context=context)
     life = context.get(_life) if context is not None else _life.get()
     if life is not None:
-        life.tasks.add(task)
-        if not life.alive:
-            task.cancel()
+        life.adopt(task)
     return task
 
 

@@ -107,6 +107,7 @@ class Papers:
         case = self._case
         if (seen := self._seen.get(task.task_id)) is None:
             seen = self._seen[task.task_id] = _Seen(task.epoch, task.state, self._faults(plant_id, task.task_id))
+            case.born_s[task.task_id] = case.truth.now()
             case.tally.tasks += 1
             case.tally.by_kind[task.kind] = case.tally.by_kind.get(task.kind, 0) + 1
         if task.epoch < seen.epoch:

@@ -123,7 +123,7 @@ class Progress:
         if pot is None:
             return case.breach("I9", f"{plant_id} did not come back")
         for task in pot.place.market.open_tasks():
-            age_s = case.truth.now() - case.loop_s(plant_id, task.created_s)
+            age_s = case.truth.now() - case.born_s.get(task.task_id, case.truth.now())
             if age_s > DRAIN_S and not case.truth.pots[plant_id].probe_silent:
                 why = f"still {task.state} after a calm: {task.reason or task.phase}"
                 case.breach("I9", f"{task.task_id} ({task.kind}) is {why}")

@@ -72,7 +72,7 @@ def soak(plan: Plan, told: Callable[[float], None] = lambda share: None) -> Outc
     base = MEMORY if MEMORY.is_dir() else None
     with tempfile.TemporaryDirectory(dir=base) as folder, coarse(), warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)
-        with asyncio.Runner(loop_factory=SoakLoop) as runner:
+        with asyncio.Runner(loop_factory=lambda: SoakLoop(random.Random(f"{plan.seed}/loop"))) as runner:
             runner.get_loop().set_exception_handler(lambda loop, context: None)
             outcome = runner.run(_soak(plan, Path(folder), told))
     forget_the_dead()
@@ -190,8 +190,10 @@ class People:
             await self._rng.choice((self._ask, self._ask, self._ask, self._ask, self._change, self._cancel, self._stop))()
 
     async def _ask(self) -> None:
-        kind = self._rng.choice(("water", "inventory", "harvest", "harvest"))
-        await self._call(self._plant(), "POST", "/tasks", {"kind": kind}, tries=3)
+        wish: dict[str, object] = {"kind": self._rng.choice(("water", "inventory", "harvest", "harvest"))}
+        wish |= {"priority": self._rng.choice((2, 5, 9))} if self._rng.random() < 0.3 else {}
+        wish |= {"within_s": self._rng.choice((60.0, 300.0, 1200.0))} if self._rng.random() < 0.3 else {}
+        await self._call(self._plant(), "POST", "/tasks", wish, tries=3)
 
     async def _change(self) -> None:
         patch = {"dose_ml": self._rng.choice((40.0, 50.0, 60.0)), "threshold_ratio": self._rng.choice((0.19, 0.20))}
