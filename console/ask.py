@@ -19,7 +19,7 @@ from rich.live import Live
 from console import tables
 from console.diagram import text, write
 from console.folder import Folder
-from console.orders import order_of, place
+from console.orders import call_off, order_of, place
 from console.snapshot import all_tasks, look
 from console.story import Story, remembered, tell
 from core.allocation.epochs import owner_of
@@ -30,7 +30,7 @@ from core.mesh.http import HttpTransport
 from core.mesh.peers import Peer, PeerKind, Peers
 from core.wire.documents import Document, HistoryEntry
 from core.wire.market import Task, TaskRequest
-from core.wire.order import Order, OrderRequest
+from core.wire.order import Order, OrderPart, OrderRequest
 from core.wire.plant import PlantState
 from core.wire.robot import Job, JobKind, JobRequest, RobotState, Stopped, StopRequest
 
@@ -215,6 +215,29 @@ def harvest(count: int, plant: str, wait: bool, within_s: float | None, priority
     _show(ended, as_json, lambda: tables.order(ended))
     if ended.state not in ("running", "done"):
         sys.exit(1)
+
+
+def cancel(name: str, data: Path, as_json: bool) -> None:
+    """A task, or an order with all its tasks; the same again changes nothing."""
+
+    async def off(line: Line, plant_id: str, task_id: str) -> Task:
+        return await line.mesh.call(line.peer(plant_id, "plant"), "DELETE", f"/tasks/{task_id}", expect=Task)
+
+    async def ask(line: Line) -> Task | Order:
+        if owner := owner_of(name):
+            return await off(line, owner, name)
+        if (order := order_of(name, await all_tasks(line.mesh, line.peers))) is None:
+            raise NotFound(f"nobody knows a task or an order {name!r}", hint="`garden tasks` lists the tasks")
+
+        async def part_off(part: OrderPart) -> Task:
+            return await off(line, part.plant_id, part.task_id)
+
+        await call_off(order, part_off)
+        return order_of(name, await all_tasks(line.mesh, line.peers), order) or order
+
+    ended = _run(data, "operator", ask)
+    told = f"{ended.task_id}: {ended.state}" if isinstance(ended, Task) else ""
+    _show(ended, as_json, lambda: tables.order(ended) if isinstance(ended, Order) else told)
 
 
 async def _order(line: Line, wish: OrderRequest, pots: list[Peer]) -> Order:

@@ -216,6 +216,18 @@ def harvest(
     ask.harvest(count, plant, wait, within, priority, data, as_json)
 
 
+@app.command()
+def cancel(
+    name: Annotated[str, typer.Argument(metavar="ID", help="A task's id, or an order's")],
+    data: Data = DATA,
+    as_json: Json = False,
+) -> None:
+    """Call off a task, or an order with all its tasks."""
+    from console import ask
+
+    ask.cancel(name, data, as_json)
+
+
 Robot = Annotated[str, typer.Argument(help="Which robot")]
 AnyRobot = Annotated[str, typer.Argument(help="Which robot; all of them if not given")]
 Wait = Annotated[bool, typer.Option("--wait", help="Come back when the job has ended")]

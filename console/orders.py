@@ -6,11 +6,12 @@ the console, and no token is kept.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from core.allocation.picking import may_be_picked
-from core.errors import GardenError, Refused
+from core.errors import Conflict, GardenError, NotFound, Refused
 from core.mesh.client import Mesh
 from core.mesh.peers import Peer
 from core.wire.fruit import Forecast, Inventory
@@ -92,6 +93,27 @@ async def place(order_id: str, wish: OrderRequest, pots: Sequence[Peer], mesh: M
         except GardenError as error:
             parts.append(OrderPart(plant_id=name, count=count, state="failed", reason=str(error)[:500]))
     return parts
+
+
+async def call_off(order: Order, cancel: Callable[[OrderPart], Awaitable[object]]) -> None:
+    """Cancel at its pot every part that has not ended; one that ended meanwhile, or that its pot forgot, is as good.
+
+    All pots are asked; then the first error is raised, and the same again reaches those that did not answer.
+    """
+
+    async def end(part: OrderPart) -> GardenError | None:
+        try:
+            await cancel(part)
+        except (Conflict, Refused, NotFound):
+            return None
+        except GardenError as error:
+            return error
+        return None
+
+    left = [part for part in order.parts if part.task_id and part.state not in FINAL_STATES]
+    if failed := [error for error in await asyncio.gather(*map(end, left)) if error is not None]:
+        failed[0].hint = failed[0].hint or "all other parts are called off; ask again once that pot answers"
+        raise failed[0]
 
 
 def order_of(order_id: str, tasks: Sequence[Task], before: Order | None = None) -> Order | None:

@@ -9,7 +9,7 @@ from typing import Annotated, TypeVar
 from fastapi import FastAPI, Header, Path, Query
 from starlette.responses import Response
 
-from console.orders import order_of, place
+from console.orders import call_off, order_of, place
 from console.snapshot import Snapshot, all_tasks, look
 from core.clock import Clock
 from core.errors import GardenError, NotFound, PeerDown
@@ -21,7 +21,7 @@ from core.mesh.peers import Peer, Peers
 from core.mesh.runtime import Runtime
 from core.wire.documents import Document, NodeCard
 from core.wire.market import Task, TaskRequest
-from core.wire.order import Order, OrderRequest
+from core.wire.order import Order, OrderPart, OrderRequest
 from core.wire.robot import Stopped, StopRequest
 
 D = TypeVar("D", bound=Document)
@@ -181,6 +181,17 @@ class Counter:
             self._orders[order_id] = found
         return found
 
+    async def call_off(self, order_id: str, token: str) -> Order:
+        """Raises NotFound, or PeerDown when a pot did not answer; the others have been told then."""
+
+        async def cancel(part: OrderPart) -> Task:
+            return await _pass_on(
+                self._mesh, self._peers.get(part.plant_id), f"/tasks/{part.task_id}", b"", token, Task, "DELETE"
+            )
+
+        await call_off(await self.order(order_id), cancel)
+        return await self.order(order_id)
+
     async def orders(self) -> list[Order]:
         """Newest first."""
         tasks = await all_tasks(self._mesh, self._peers)
@@ -198,6 +209,10 @@ def _add_orders(app: FastAPI, counter: Counter) -> None:
     async def order(order_id: Name) -> Order:
         return await counter.order(order_id)
 
+    @app.delete("/orders/{order_id}", tags=["orders"], summary="Call off what has not been picked yet")
+    async def cancel(order_id: Name, authorization: Token = "", caller: Caller = allow("operator")) -> Order:
+        return await counter.call_off(order_id, authorization)
+
     @app.post("/orders", tags=["orders"], summary="Order ripe fruit", status_code=201)
     async def take(
         response: Response,
@@ -210,7 +225,9 @@ def _add_orders(app: FastAPI, counter: Counter) -> None:
         return taken
 
 
-async def _pass_on(mesh: Mesh, peer: Peer, path: str, content: bytes, token: str, expect: type[D]) -> D:
+async def _pass_on(
+    mesh: Mesh, peer: Peer, path: str, content: bytes, token: str, expect: type[D], method: str = "POST"
+) -> D:
     """With the caller's own token: the console has no power of its own."""
-    answer = await mesh.exchange(peer, "POST", path, content, headers={"authorization": token})
+    answer = await mesh.exchange(peer, method, path, content, headers={"authorization": token})
     return read(peer, answer, expect)

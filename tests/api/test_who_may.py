@@ -57,6 +57,7 @@ MAY: dict[tuple[str, str, str], set[str] | str] = {
     ("sim", "DELETE", "/faults/{fault_id}"): OPERATOR,
     **{("console", "GET", path): ANYBODY for path in ("/api/garden", "/overview.jpg", "/orders", "/orders/{order_id}")},
     ("console", "POST", "/orders"): OPERATOR,
+    ("console", "DELETE", "/orders/{order_id}"): OPERATOR,
     ("console", "POST", "/api/stop"): set(ROLES),
     ("console", "POST", "/api/resume"): OPERATOR,
     ("console", "POST", "/api/plants/{plant_id}/water"): OPERATOR,

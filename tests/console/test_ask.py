@@ -57,7 +57,7 @@ def pot(name: str, verifier: Verifier) -> FastAPI:
     card = PlantCard(plant_id=name, url="http://x", stem=ORIGIN, dock=POSE, nozzle=ORIGIN)
     soil = SoilReading(state="good", ratio=0.151, age_s=1.0)
     state = PlantState(plant_id=name, now_s=12.0, soil=soil, thirsty=True, settings=Settings(), card=card)
-    listed = [TASK] if name == "plant-1" else []
+    app.state.listed = listed = [TASK] if name == "plant-1" else []
 
     @app.get("/state")
     async def told() -> PlantState:
@@ -72,6 +72,14 @@ def pot(name: str, verifier: Verifier) -> FastAPI:
         if not any(one.task_id == task_id for one in listed):
             raise NotFound("no such task")
         return TASK
+
+    @app.delete("/tasks/{task_id}")
+    async def cancel(task_id: str, caller: Caller = allow("operator")) -> Task:
+        for i, one in enumerate(listed):
+            if one.task_id == task_id:
+                listed[i] = one.model_copy(update={"state": "cancelled", "reason": f"cancelled by {caller.subject}"})
+                return listed[i]
+        raise NotFound("no such task")
 
     @app.post("/tasks", status_code=201)
     async def water(request: TaskRequest = body(TaskRequest), caller: Caller = allow("operator")) -> Task:
@@ -213,6 +221,20 @@ def test_water_is_asked_for_with_the_operators_token(street: Street, tmp_path: P
     assert "within_s" in str(refused(tmp_path, "water", "plant-1", "--within", "0"))
 
 
+def test_a_task_or_an_order_is_called_off_by_its_id(street: Street, tmp_path: Path) -> None:
+    ended = asked(tmp_path, "cancel", "plant-1:1:1")
+    assert (ended["state"], ended["reason"]) == ("cancelled", "cancelled by operator")
+    harvest = TASK.model_copy(update={"kind": "harvest", "order_id": "o7", "count": 2})
+    for number, name in enumerate(("plant-2", "plant-3")):
+        url = next(peer.url for peer in Folder(tmp_path).peers() if peer.id == name)
+        pot_app = street.apps[int(url.rpartition(":")[2])]
+        pot_app.state.listed.append(harvest.model_copy(update={"task_id": f"{name}:1:{number}", "plant_id": name}))
+    for _ in range(2):
+        order = asked(tmp_path, "cancel", "o7")
+        assert (order["state"], [part["state"] for part in order["parts"]]) == ("cancelled", ["cancelled"] * 2)
+    assert "nobody knows" in str(refused(tmp_path, "cancel", "o8"))
+
+
 def test_stop_stops_all_and_resume_needs_the_operator(street: Street, tmp_path: Path) -> None:
     assert [one["stopped"] for one in asked(tmp_path, "stop")] == [True, True]
     assert "STOPPED" in garden(tmp_path, "robots").stdout
@@ -290,5 +312,27 @@ def test_the_console_shows_and_stops_with_the_callers_own_token(console: httpx.A
             task = await console.post("/api/plants/plant-2/water", json={"kind": "water"}, headers=bearer("operator"))
             assert (task.json()["plant_id"], task.json()["asked_by"]) == ("plant-2", "operator")
             assert (await console.get("/overview.jpg")).status_code == 502
+
+    asyncio.run(story())
+
+
+def test_the_console_calls_an_order_off_with_the_callers_own_token(
+    console: httpx.AsyncClient, street: Street, tmp_path: Path
+) -> None:
+    url = next(peer.url for peer in Folder(tmp_path).peers() if peer.id == "plant-2")
+    more = {"kind": "harvest", "order_id": "o7", "task_id": "plant-2:1:1", "plant_id": "plant-2", "count": 2}
+    street.apps[int(url.rpartition(":")[2])].state.listed.append(TASK.model_copy(update=more))
+    operator, viewer = (
+        {"authorization": f"Bearer {Folder(tmp_path).identity(role).token}"} for role in ("operator", "viewer")
+    )
+
+    async def story() -> None:
+        async with console:
+            assert (await console.delete("/orders/o7", headers=viewer)).status_code == 403
+            assert (await console.get("/orders/o7")).json()["state"] == "running"
+            for _ in range(2):
+                ended = (await console.delete("/orders/o7", headers=operator)).json()
+                assert (ended["state"], ended["parts"][0]["reason"]) == ("cancelled", "cancelled by operator")
+            assert (await console.delete("/orders/o8", headers=operator)).status_code == 404
 
     asyncio.run(story())

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from console.orders import Stock, order_of, split
+from console.orders import Stock, call_off, order_of, split
+from core.errors import Conflict, PeerDown
 from core.wire.fruit import Pick
 from core.wire.market import Task
 from core.wire.order import Order, OrderPart
@@ -75,3 +78,48 @@ def test_a_console_that_forgot_an_order_reads_it_from_the_pots() -> None:
     told = order_of("o1", [task("plant-1", "done", 2, asked_by="operator")])
     assert told is not None
     assert (told.count, told.delivered, told.state, told.asked_by) == (2, 2, "done", "operator")
+
+
+def test_calling_off_an_order_cancels_what_has_not_ended_and_the_same_again_nothing() -> None:
+    pots = {
+        "plant-1": task("plant-1", "done", 2),
+        "plant-2": task("plant-2", "running", 1),
+        "plant-3": task("plant-3", "awarded", 0),
+    }
+    asked: list[str] = []
+
+    async def cancel(part: OrderPart) -> Task:
+        asked.append(part.task_id)
+        if part.plant_id == "plant-3":
+            raise Conflict(f"{part.task_id} is done already")
+        pots[part.plant_id] = pots[part.plant_id].model_copy(update={"state": "cancelled"})
+        return pots[part.plant_id]
+
+    async def off() -> Order:
+        before = order_of("o1", list(pots.values()), wished(6))
+        assert before is not None
+        await call_off(before, cancel)
+        return order_of("o1", list(pots.values()), before) or before
+
+    asyncio.run(off())
+    assert asked == ["plant-2:1:1", "plant-3:1:1"]
+    pots["plant-3"] = pots["plant-3"].model_copy(update={"state": "done"})
+    again = asyncio.run(off())
+    assert asked == ["plant-2:1:1", "plant-3:1:1"]
+    assert (again.state, again.delivered) == ("partial", 3)
+
+
+def test_a_pot_that_does_not_answer_is_told_of_after_all_others_were_asked() -> None:
+    asked: list[str] = []
+
+    async def cancel(part: OrderPart) -> None:
+        asked.append(part.plant_id)
+        if part.plant_id == "plant-1":
+            raise PeerDown("plant-1 does not answer")
+
+    order = order_of("o1", [task("plant-1", "running", 0), task("plant-2", "running", 0)], wished(4))
+    assert order is not None
+    with pytest.raises(PeerDown) as caught:
+        asyncio.run(call_off(order, cancel))
+    assert asked == ["plant-1", "plant-2"]
+    assert "ask again" in caught.value.hint
