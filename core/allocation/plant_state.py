@@ -53,6 +53,8 @@ class Rules:
     events_kept: int = 40
     finished_kept: int = 20
     open_max: int = 16
+    auctions_max: int = 4
+    """Rounds of bids that are open at the same time; further tasks wait, the more urgent first."""
 
 
 @dataclass(slots=True, kw_only=True)

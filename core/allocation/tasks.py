@@ -121,7 +121,7 @@ class TaskBook:
 
     def tick(self, now_s: float, robots: Sequence[str]) -> None:
         """Whatever is due at this time: rounds to open or close, leases that ended, awards to send again."""
-        for task in self.open_tasks():
+        for task in sorted(self.open_tasks(), key=lambda task: -task.priority):
             if self._task_due_s(task) > now_s:
                 continue
             live = self._live[task.task_id]
@@ -148,7 +148,7 @@ class TaskBook:
         elif now_s >= live.resend_s:
             live.resend_s = now_s + self.rules.resend_s
             self._effects.append(self._grant(task, live.cost_s, now_s))
-        elif now_s >= live.reallocate_s:
+        elif now_s >= max(live.reallocate_s, self._free_s()):
             self._open_round(task, "reallocate", robots, now_s)
 
     def _task_due_s(self, task: Task) -> float:
@@ -159,11 +159,16 @@ class TaskBook:
         if live.round is not None:
             return min(live.round.deadline_s, math.inf if task.state == "announced" else live.lease_until_s)
         if task.state == "announced":
-            return max(live.next_ask_s, self._blocked_until_s(task))
+            return max(live.next_ask_s, self._blocked_until_s(task), self._free_s())
         if (permit_due_s := self._permit_due_s(task, live)) is not None:
             return permit_due_s
         overrun_s = live.running_since_s + self.rules.run_s_max
-        return min(live.lease_until_s, live.resend_s, live.reallocate_s, overrun_s)
+        return min(live.lease_until_s, live.resend_s, max(live.reallocate_s, self._free_s()), overrun_s)
+
+    def _free_s(self) -> float:
+        """When a further round may open at the latest, as far as is known: as many may be open at once."""
+        ends_s = [live.round.deadline_s for live in self._live.values() if live.round is not None]
+        return min(ends_s) if len(ends_s) >= self.rules.auctions_max else -math.inf
 
     # Rounds
 
