@@ -33,7 +33,7 @@ M2_A_PLANT = 3.0
 WORD_S = (0.002, 0.02)
 TOGETHER_S = 20.0
 """Everybody asks within so long."""
-_RULES = Rules(lease_s=1e6)
+RULES = Rules(lease_s=1e6)
 """Nobody falls silent here."""
 
 
@@ -103,8 +103,10 @@ class Outcome:
 class Crowd:
     """Runs one instance to its end. `bid` prices a task; all plants ask within `together_s`."""
 
-    def __init__(self, instance: Instance, rng: Random, bid: Price = price, together_s: float = TOGETHER_S) -> None:
-        self._instance, self._rng, self._bid, self._together_s = instance, rng, bid, together_s
+    def __init__(
+        self, instance: Instance, rng: Random, bid: Price = price, together_s: float = TOGETHER_S, rules: Rules = RULES
+    ) -> None:
+        self._instance, self._rng, self._bid, self._together_s, self._rules = instance, rng, bid, together_s, rules
         self._plants = [self._market(n) for n in range(len(instance.plants))]
         self._docks = {f"plant-{number}": at for number, at in enumerate(instance.plants)}
         self._workers = {f"robot-{n:03}": Worker(f"robot-{n:03}", at) for n, at in enumerate(instance.starts)}
@@ -121,7 +123,7 @@ class Crowd:
             plant_id=f"plant-{number}", url="http://plant", stem=Point3(x_m=x_m, y_m=y_m, z_m=0.25),
             dock=Pose2(x_m=x_m, y_m=y_m, yaw_rad=0.0), nozzle=Point3(x_m=0.0, y_m=0.0, z_m=0.0),
         )  # fmt: skip
-        return Market(card, None, 0.0, _RULES)
+        return Market(card, None, 0.0, self._rules)
 
     def run(self) -> Outcome:
         for number in range(len(self._plants)):

@@ -20,6 +20,7 @@ BENCHES = {
     "wavefront": "lab.bench.wavefront:bench_wavefront",
     "camera": "lab.bench.camera:bench_camera",
     "pot": "lab.bench.pot:bench_pot",
+    "market": "lab.bench.market:bench_market",
     "broadcast": "lab.bench.broadcast:bench_broadcast",
     "detector": "lab.bench.detector:bench_detector",
     "vision": "lab.bench.vision:bench_vision",
