@@ -30,8 +30,6 @@ class Acts:
     def __init__(self, case: Case) -> None:
         self._case, self._truth = case, case.truth
         self._limits = Limits()
-        self._asked: dict[tuple[str, str, str], float] = {}
-        """When a robot first asked for a permit."""
         self._last: dict[str, Given] = {}
         """The newest permit to water, by plant."""
 
@@ -66,7 +64,7 @@ class Acts:
         if held.robot_id != dose.robot_id or held.plant_id != dose.plant_id:
             case.breach("I1", f"{dose.robot_id} pumps at {dose.plant_id} under {held.robot_id}'s permit {held.permit_id}")
         earlier = self._truth.doses[: dose.number]
-        late_s = dose.began_s - held.asked_s - held.valid_s * SKEW
+        late_s = dose.began_s - held.issued_s - held.valid_s * SKEW
         if late_s > BEGIN_S and not any(d.permit_id == dose.permit_id for d in earlier):
             case.breach("I2", f"{dose.robot_id} began {late_s:.1f} s after permit {held.permit_id} had run out")
         for other in self._truth.doses[-8:]:
@@ -111,10 +109,6 @@ class Acts:
 
     # Permits
 
-    def asked(self, message: Message) -> None:
-        """A robot wants a permit."""
-        self._asked.setdefault(_wish(message), self._truth.now())
-
     def given(self, message: Message, answer: Answer) -> None:
         """I1, I2: a permit leaves its plant."""
         case, said, now_s = self._case, json.loads(answer.body), self._truth.now()
@@ -126,7 +120,7 @@ class Acts:
             case.breach("I1", f"{said['task_id']} is {holder}'s, epoch {epoch}, and {message.source} got a permit")
         permit = Given(
             said["permit_id"], said["task_id"], message.source, message.target, said["act"], said["epoch"], said["dose_ml"],
-            self._asked.get(_wish(message), now_s), now_s, said["valid_for_s"],
+            now_s, said["valid_for_s"],
         )  # fmt: skip
         case.permits[permit.permit_id] = permit
         if permit.act != "water":
@@ -134,8 +128,3 @@ class Acts:
         before, self._last[permit.plant_id] = self._last.get(permit.plant_id), permit
         if before is not None and not self._measured(before.issued_s, permit):
             case.breach("I2", f"{permit.plant_id} gave {permit.permit_id} without a measurement after {before.permit_id}")
-
-
-def _wish(message: Message) -> tuple[str, str, str]:
-    wish = json.loads(message.body)
-    return message.path, message.source, f"{wish['epoch']}/{wish['fruit_id']}"

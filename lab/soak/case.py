@@ -34,7 +34,6 @@ class Given:
     act: str
     epoch: int
     dose_ml: float
-    asked_s: float
     issued_s: float
     valid_s: float
 

@@ -75,8 +75,6 @@ class Judge:
             self.awards.asked(message)
         elif message.path == "/resume":
             self._case.stopped.discard(message.target)
-        elif message.path.endswith("/permits"):
-            self.acts.asked(message)
 
     def _answered(self, message: Message, answer: Answer) -> None:
         """What left a node."""

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from core.allocation.bidding import DRIP_S
+from core.allocation.permits import longest_act_s
 from core.geometry.planar import between
 from core.robots import gardener
 from core.wire.market import Permit, PlantCard
@@ -67,10 +68,15 @@ def _believe(poured: Poured, before_ml: float | None, after_ml: float | None) ->
 
 async def _pour(robot: Robot, permit: Permit, asked_s: float, poured: Poured) -> None:
     began_s = grown_s = robot.clock.now()
-    if began_s - asked_s > permit.valid_for_s:
-        raise SkillFailed("the permit ran out before the pump could start")
     longest_s = permit.dose_ml / gardener.PUMP_MLPS * 2 + STALL_S
     while True:
+        # Looked at before every turn: this process may have slept since the last.
+        since_s = robot.clock.now() - asked_s
+        if since_s > permit.valid_for_s and poured.delivered_ml == 0.0:
+            raise SkillFailed("the permit ran out before the pump could start")
+        if since_s > permit.valid_for_s + longest_act_s(permit.dose_ml):
+            poured.why = f"the act took too long and was ended at {poured.delivered_ml:.0f} ml"
+            return
         robot.body.want(pump=True, permit_id=permit.permit_id, dose_ml=permit.dose_ml)
         state = await robot.tick()
         if state.permit_id == permit.permit_id and state.pumped_ml > poured.delivered_ml:
