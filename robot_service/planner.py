@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from core.allocation.bidding import BATTERY_ENOUGH_RATIO, Travel
 from core.allocation.queue import Entry
-from core.errors import GardenError, PeerDown
+from core.errors import GardenError, NotFound, PeerDown
 from core.mesh.client import retry
 from core.wire.fruit import Fruit, Inventory, Pick, Scan
 from core.wire.market import Announcement, Permit, PermitRequest, PlantCard, Report
@@ -92,7 +92,8 @@ class Planner:
         self.robot.activity.job = "act"
         entry.progress = 0.6
         wish = PermitRequest(robot_id=self.robot.settings.id, epoch=entry.epoch, act="water", amount_ml=asked.dose_ml)
-        await water(self.robot, asked.plant, lambda: self._permit(entry, asked, wish), poured)
+        known = await self._known(asked)
+        await water(self.robot, asked.plant, lambda: self._permit(entry, asked, wish), poured, known)
 
     async def _inventory(self, entry: Entry, asked: Announcement) -> None:
         await dock_at(self.robot, self.docks, asked.plant.plant_id)
@@ -144,12 +145,15 @@ class Planner:
             raise SkillFailed("; ".join(f"{pick.fruit_id}: {pick.reason}" for pick in picks)[:400] or "nothing to pick")
 
     async def _known(self, asked: Announcement) -> list[Fruit]:
-        """All fruit of the plant: those that are not to be picked are in the way. Without an answer, what was announced."""
+        """All fruit of the plant: the hand keeps away from those that are not to be picked. Without an answer, what was
+        announced; a plant need not keep an inventory."""
         plant = self.robot.peers.get(asked.plant.plant_id)
         try:
             return (await self.robot.mesh.call(plant, "GET", "/inventory", expect=Inventory)).fruits
+        except NotFound:
+            return asked.fruits
         except GardenError as error:
-            self.robot.note("pick", f"neighbours are unknown, no inventory: {error}", task_id=asked.task_id)
+            self.robot.note(asked.kind, f"fruit in the way are unknown, no inventory: {error}", task_id=asked.task_id)
             return asked.fruits
 
     def _keep_picture(self, asked: Announcement) -> KeepPicture:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 from core.allocation.bidding import DRIP_S
 from core.allocation.permits import longest_act_s
-from core.geometry.planar import between
+from core.errors import Refused
+from core.manipulation.approach import Obstacle
+from core.manipulation.pouring import Pouring, pouring
+from core.manipulation.swing import Leg
 from core.robots import gardener
+from core.wire.fruit import Fruit
 from core.wire.market import Permit, PlantCard
 from robot_service.robot import Robot, SkillFailed
-from robot_service.skills.arm import fold_arm, reach
+from robot_service.skills.arm import fold_arm, move_arm, reach, withdraw
+from robot_service.skills.hand import FAST_SHARE, Grip, go_along, swing_to
+from robot_service.skills.plantframe import mapped, plant_in_base
 
 STALL_S = 5.0
 DOSE_END_ML = 0.1
@@ -20,6 +25,9 @@ ENOUGH_ML, SHORT_S = 2.0, 0.5
 """A dose this near to its end that does not grow any more is done."""
 DRY_ML = 4.0
 """The tank's sensor reads this little when nothing comes any more."""
+WAY_COST_S = 0.05
+"""To find the way of the nozzle among twenty fruit."""
+ARRIVE_S = 0.1
 LEVEL_ERROR_ML = 20.0
 """Two readings of the tank's level differ by this much at most without any water having gone."""
 
@@ -35,25 +43,42 @@ class Poured:
     why: str = ""
 
 
-def nozzle_in_base(pose: tuple[float, float, float], plant: PlantCard) -> tuple[float, float, float]:
-    """The plant's nozzle point in the frame of a base at `pose` [m]; the plant's x points at its dock."""
-    towards_dock_rad = plant.dock.yaw_rad + math.pi
-    cos, sin = math.cos(towards_dock_rad), math.sin(towards_dock_rad)
-    x_m = plant.stem.x_m + cos * plant.nozzle.x_m - sin * plant.nozzle.y_m
-    y_m = plant.stem.y_m + sin * plant.nozzle.x_m + cos * plant.nozzle.y_m
-    along_m, aside_m, _ = between(pose, (x_m, y_m, 0.0))
-    return along_m, aside_m, plant.stem.z_m + plant.nozzle.z_m
+async def water(
+    robot: Robot, plant: PlantCard, take_permit: TakePermit, poured: Poured, known: Sequence[Fruit] = ()
+) -> None:
+    """Deliver one dose, past the fruit that are `known` to hang there.
 
-
-async def water(robot: Robot, plant: PlantCard, take_permit: TakePermit, poured: Poured) -> None:
-    """Deliver one dose. `poured` tells what came out whatever happens; raises SkillFailed when nothing could be begun."""
-    await reach(robot, nozzle_in_base(robot.pose(), plant))
+    `poured` tells what came out whatever happens; raises SkillFailed when nothing could be begun.
+    """
+    await _nozzle_over_soil(robot, plant, known)
     full_ml = robot.state().tank_ml
     permit, asked_s = await take_permit()
     await _pour(robot, permit, asked_s, poured)
     await _drip(robot, DRIP_S)
     _believe(poured, full_ml, robot.state().tank_ml)
     await fold_arm(robot)
+
+
+async def _nozzle_over_soil(robot: Robot, plant: PlantCard, known: Sequence[Fruit]) -> None:
+    """Straight to where the plant would have it; where fruit hang, along the way with the most room."""
+    T = plant_in_base(robot.pose(), plant)
+    nozzle, stem = mapped(T, (plant.nozzle.x_m, plant.nozzle.y_m, plant.nozzle.z_m)), mapped(T, (0.0, 0.0, 0.0))
+    if not known:
+        await reach(robot, nozzle)
+        return
+    fruit = [Obstacle(centre=mapped(T, (each.x_m, each.y_m, each.z_m)), radius_m=each.radius_m) for each in known]
+    try:
+        way: Pouring = await robot.clock.offload(lambda: pouring(nozzle, stem, fruit), WAY_COST_S)
+        if robot.state().arm_rad is None:
+            await fold_arm(robot)
+        await withdraw(robot)
+        await swing_to(robot, way.path[0], Grip(0.0))
+    except SkillFailed:
+        raise
+    except Refused as error:
+        raise SkillFailed(f"the nozzle cannot reach the soil: {error}") from error
+    await go_along(robot, way.path[1:], FAST_SHARE, Grip(0.0))
+    await move_arm(robot, [Leg(q=way.path[-1], duration_s=ARRIVE_S)])
 
 
 def _believe(poured: Poured, before_ml: float | None, after_ml: float | None) -> None:
