@@ -19,7 +19,7 @@ from rich.live import Live
 from console import tables
 from console.diagram import text, write
 from console.folder import Folder
-from console.orders import call_off, order_of, place
+from console.orders import TOP_UPS_MAX, Send, call_off, order_of, place, top_up
 from console.snapshot import all_tasks, look
 from console.story import Story, remembered, tell
 from core.allocation.epochs import owner_of
@@ -202,8 +202,13 @@ def harvest(count: int, plant: str, wait: bool, within_s: float | None, priority
     async def ask(line: Line) -> Order:
         pots = [line.peer(plant, "plant")] if plant else line.peers.of_kind("plant")
         order = await _order(line, wish, pots)
-        told = ""
-        while wait and order.state == "running":
+        told, top_ups = "", 0
+        while wait:
+            if order.state != "running":
+                more = await top_up(order, wish, pots, line.mesh, _sender(line)) if top_ups < TOP_UPS_MAX else None
+                if more is None:
+                    break
+                order, top_ups = more, top_ups + 1
             if not as_json and (now := tables.progress(order)) != told:
                 told = now
                 print(told, flush=True)
@@ -240,14 +245,18 @@ def cancel(name: str, data: Path, as_json: bool) -> None:
     _show(ended, as_json, lambda: tables.order(ended) if isinstance(ended, Order) else told)
 
 
+def _sender(line: Line) -> Send:
+    async def send(pot: Peer, request: TaskRequest) -> Task:
+        return await line.mesh.call(pot, "POST", "/tasks", request, expect=Task)
+
+    return send
+
+
 async def _order(line: Line, wish: OrderRequest, pots: list[Peer]) -> Order:
     now_s = line.clock.now()
     order_id = f"o{int(1000 * now_s)}"
 
-    async def send(pot: Peer, request: TaskRequest) -> Task:
-        return await line.mesh.call(pot, "POST", "/tasks", request, expect=Task)
-
-    parts = await place(order_id, wish, pots, line.mesh, send)
+    parts = await place(order_id, wish, pots, line.mesh, _sender(line))
     return Order(
         order_id=order_id, count=wish.count, plant_id=wish.plant_id, asked_by="operator", created_s=now_s, updated_s=now_s,
         parts=parts, delivered=0,

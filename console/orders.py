@@ -19,6 +19,7 @@ from core.wire.market import FINAL_STATES, Task, TaskRequest
 from core.wire.order import Order, OrderPart, OrderRequest, OrderState
 
 PER_TASK_MAX = 64
+TOP_UPS_MAX = 3
 Send = Callable[[Peer, TaskRequest], Awaitable[Task]]
 """Posts a task at a pot with the right token."""
 
@@ -93,6 +94,28 @@ async def place(order_id: str, wish: OrderRequest, pots: Sequence[Peer], mesh: M
         except GardenError as error:
             parts.append(OrderPart(plant_id=name, count=count, state="failed", reason=str(error)[:500]))
     return parts
+
+
+def missing(order: Order) -> int:
+    """How many fruit others may be asked for: none while it runs, nor when somebody called a part off."""
+    over = order.state in ("partial", "failed") and all(part.state != "cancelled" for part in order.parts)
+    return max(0, order.count - order.delivered) if over else 0
+
+
+async def top_up(order: Order, wish: OrderRequest, pots: Sequence[Peer], mesh: Mesh, send: Send) -> Order | None:
+    """Ask for what a pot could not give, wherever ripe fruit is left; None when nothing can be asked for.
+
+    Not at pots that failed, and not beyond a deadline: how much of it is left only the pots know.
+    """
+    if not (lacking := missing(order)) or wish.within_s is not None:
+        return None
+    failed = {part.plant_id for part in order.parts if part.state == "failed"}
+    others = [pot for pot in pots if pot.id not in failed]
+    try:
+        parts = await place(order.order_id, wish.model_copy(update={"count": lacking}), others, mesh, send)
+    except Refused:
+        return None
+    return order.model_copy(update={"state": "running", "parts": [*order.parts, *parts], "reason": ""})
 
 
 async def call_off(order: Order, cancel: Callable[[OrderPart], Awaitable[object]]) -> None:

@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from console.orders import Stock, call_off, order_of, split
+from console.orders import Stock, call_off, missing, order_of, split, top_up
 from core.errors import Conflict, PeerDown
-from core.wire.fruit import Pick
-from core.wire.market import Task
-from core.wire.order import Order, OrderPart
+from core.mesh.peers import Peer
+from core.wire.fruit import Forecast, Fruit, Inventory, Pick
+from core.wire.market import Task, TaskRequest
+from core.wire.order import Order, OrderPart, OrderRequest
 
 stocks = st.dictionaries(
     st.sampled_from(["plant-1", "plant-2", "plant-3", "plant-4"]), st.builds(Stock, st.integers(0, 9), st.floats(0, 20))
@@ -123,3 +124,60 @@ def test_a_pot_that_does_not_answer_is_told_of_after_all_others_were_asked() -> 
         asyncio.run(call_off(order, cancel))
     assert asked == ["plant-1", "plant-2"]
     assert "ask again" in caught.value.hint
+
+
+class Pots:
+    """A mesh with pots that know so many ripe fruit."""
+
+    def __init__(self, **ripe: int) -> None:
+        self.peers = [Peer(id=name, kind="plant", url=f"http://{name}") for name in ripe]
+        self.ripe, self.asked = ripe, list[tuple[str, int]]()
+
+    async def ask_all(self, pots: list[Peer], method: str, path: str, *, expect: Any) -> dict[str, Any]:
+        return {pot.id: self.answer(pot.id, path) for pot in pots}
+
+    def answer(self, name: str, path: str) -> Any:
+        if path.startswith("/inventory"):
+            red = {
+                "colour": "red",
+                "confidence": 0.95,
+                "sigma_m": 0.004,
+                "x_m": 0.1,
+                "y_m": 0.0,
+                "z_m": 0.3,
+                "radius_m": 0.013,
+            }
+            fruits = [Fruit.model_validate({"fruit_id": f"{name}:f{i}", **red}) for i in range(self.ripe[name])]
+            return Inventory(plant_id=name, scanned_s=1.0, fruits=fruits)
+        return [] if path == "/tasks" else Forecast(plant_id=name, now_s=0.0, ahead_s=1.0)
+
+    async def send(self, pot: Peer, request: TaskRequest) -> Task:
+        self.asked.append((pot.id, request.count or 0))
+        return task(pot.id, "announced", 0, request.count or 0)
+
+    def top_up(self, order: Order, wish: OrderRequest) -> Order | None:
+        return asyncio.run(top_up(order, wish, self.peers, self, self.send))  # type: ignore[arg-type]
+
+
+def test_what_one_pot_could_not_give_is_asked_of_others_but_not_of_those_that_failed() -> None:
+    pots = Pots(**{"plant-1": 2, "plant-2": 5, "plant-3": 1})
+    order = order_of("o1", [task("plant-1", "done", 1), task("plant-2", "failed", 0)], wished(4))
+    assert order is not None
+    assert missing(order) == 3
+    more = pots.top_up(order, OrderRequest(count=4))
+    assert more is not None
+    assert sorted(pots.asked) == [("plant-1", 2), ("plant-3", 1)]
+    assert (more.state, more.count, len(more.parts)) == ("running", 4, 4)
+
+
+def test_an_order_is_not_topped_up_while_it_runs_once_called_off_nor_under_a_deadline() -> None:
+    pots, wish = Pots(**{"plant-3": 9}), OrderRequest(count=4)
+    for states in (("done", "running"), ("done", "cancelled")):
+        order = order_of("o1", [task("plant-1", states[0], 1), task("plant-2", states[1], 0)], wished(4))
+        assert order is not None
+        assert pots.top_up(order, wish) is None
+    short = order_of("o1", [task("plant-1", "done", 1)], wished(4))
+    assert short is not None
+    assert pots.top_up(short, wish.model_copy(update={"within_s": 60.0})) is None
+    assert Pots(**{"plant-3": 0}).top_up(short, wish) is None
+    assert pots.asked == []
