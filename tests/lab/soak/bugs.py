@@ -289,3 +289,15 @@ def a_spent_permit_pours_again():
 
     with mock.patch.object(Doser, "delivered_ml", forgetful):
         yield
+
+
+@bug
+def an_estop_is_confirmed_before_it_is_written_down():
+    real = StopLatch.press
+
+    def press(self, by):
+        real(self, by)
+        self.kept = True
+
+    with mock.patch.object(StopLatch, "press", press):
+        yield
