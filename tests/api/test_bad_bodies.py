@@ -65,7 +65,7 @@ GOOD: dict[tuple[str, str, str], dict[str, Any]] = {
     ("station", "POST", "/dock/reservations"): RESERVE | {"dock_id": "tap"},
     ("station", "POST", "/tap"): {"robot_id": "robot-1", "open_s": 2.0},
     ("robot", "POST", "/bids"): ANNOUNCED,
-    ("robot", "POST", "/tasks"): {"announcement": ANNOUNCED, "epoch": 1, "lease_s": 8.0, "cost_s": 20.0},
+    ("robot", "POST", "/tasks"): {"announcement": ANNOUNCED, "epoch": 1, "lease_s": 8.0, "cost_s": 20.0, "at_most_s": 500.0},
     ("robot", "POST", "/jobs"): {"kind": "goto", "x_m": -1.5, "y_m": 0.4, "yaw_rad": 1.0, "at": ""},
     ("robot", "POST", "/stop"): {"reason": "a test"},
     ("sim", "PATCH", "/clock"): {"speed": 3.0, "paused": False},
