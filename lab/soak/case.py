@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from lab.soak.faults import Gremlin
+from lab.soak.faults import Gremlin, disk_failed
 from lab.soak.garden import SoakGarden
 from lab.soak.world import Truth
 
@@ -84,9 +84,9 @@ class Case:
         return ()
 
     def away(self, name: str) -> bool:
-        """Dead, or asleep."""
+        """Dead, asleep, or waiting for somebody to mend its disk."""
         running = self.garden.running.get(name)
-        return running is None or running.life.stopped
+        return running is None or running.life.stopped or disk_failed(running)
 
     def loop_s(self, plant_id: str, garden_s: float) -> float:
         """A running plant's time as that of the loop."""

@@ -149,7 +149,7 @@ class Gremlin:
                 self.garden.start(name)
             elif running.life.stopped:
                 running.life.go_on()
-            elif _broken(running):
+            elif disk_failed(running):
                 self.garden.kill(name)
                 self.garden.start(name)
             self.touch(name)
@@ -434,8 +434,8 @@ def _named(message: Message, answer: Answer | None) -> str:
     return ""
 
 
-def _broken(running: Running) -> bool:
-    """A service whose disk failed it needs a person."""
+def disk_failed(running: Running) -> bool:
+    """A service whose disk failed it acknowledges nothing until a person comes."""
     if running.body is not None:
         return bool(running.body.ledger.refusal(1.0).startswith("doses cannot"))
     pot = getattr(running.app.state, "pot", None) if running.app is not None else None
