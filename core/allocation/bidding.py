@@ -1,6 +1,7 @@
 """A robot's price for a task in seconds that somebody waits, with the breakdown, or the reason why not.
 
-Those until it would be done, and those that all behind it wait longer for it: each task of the queue, and whoever asks next.
+Those until it would be done, and those that all behind it wait longer for it: each task of the queue, and whoever asks a
+busy robot next. A free one says when it would be done.
 Pure: what the robot knows of itself comes in as a `Condition`, distances through a function.
 Source: paper 000, section 7 (cost of distance, queue and abilities); Lagoudakis et al. 2005 (bids for the least mean
 waiting time, MiniAve); charge and refill on the way are ours.
@@ -320,7 +321,8 @@ def _inserted(asked: Announcement, route: _Route, index: int, current_s: float) 
     later_s = route.later_s(walk, before_s + refill + charging + travel + work, index)
     if later_s is None:
         return "no way to what is later in the queue"
-    put_off = len(route.queue) - index + 1
+    busy = current_s > 0.0 or bool(route.queue)
+    put_off = len(route.queue) - index + int(busy)
     return _Parts(current_s, before_s, travel, work, charging, refill, put_off * later_s)
 
 

@@ -70,7 +70,7 @@ class Breakdown(Document):
     charge_s: Seconds = 0.0
     refill_s: Seconds = 0.0
     delay_s: Seconds = 0.0
-    """What others wait longer, added up: each task behind it in the queue, and whatever is asked for next."""
+    """What others wait longer, added up: each task behind it in the queue, and whatever a busy robot is asked for next."""
 
 
 class Bid(Document):

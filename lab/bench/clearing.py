@@ -73,7 +73,7 @@ def _price(plant: int, start: Floats, plants: Floats, queue: Ints, length: int) 
             fx, fy = nx, ny
             ahead_s += leg_s + WORK_S
             to_s = back_s
-        price_s = own_s + (length - place + 1) * max(0.0, later_s)
+        price_s = own_s + (length - place + (length > 0)) * max(0.0, later_s)
         if price_s <= best_s:
             best_s, best_place = price_s, place
     return best_s, best_place

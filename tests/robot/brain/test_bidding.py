@@ -107,9 +107,16 @@ def test_a_bid_is_the_seconds_until_it_is_done_and_those_that_all_behind_it_wait
     assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
 
 
-def test_a_free_robot_is_kept_from_whoever_asks_next():
+def test_a_free_robot_bids_the_seconds_until_it_is_done():
     bid = price(asked(), ME)
-    assert bid.breakdown.delay_s == pytest.approx(done_s(bid.breakdown))
+    assert bid.breakdown.delay_s == 0.0
+    assert bid.cost_s == pytest.approx(10.0 + DOCKING_S + work_s("water", 150.0))
+
+
+def test_whoever_asks_a_busy_robot_next_waits_longer_as_well():
+    bid = price(asked(), replace(ME, docked_at="spare", battery_ratio=0.3, current=Stop(dock="", charge=True)))
+    added_s = bid.breakdown.travel_s + bid.breakdown.work_s
+    assert bid.breakdown.delay_s == pytest.approx(added_s)
 
 
 def test_a_task_goes_where_everybody_together_waits_least():
