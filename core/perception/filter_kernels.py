@@ -42,30 +42,16 @@ def planes(image: Bytes, bins: Ints, luma: Floats, table: Floats, shares: Floats
 
 
 @njit(cache=True, fastmath=True)
-def packed(planes: Floats, smooth: Floats, spots: Floats, red_blobs: Floats, green_blobs: Floats) -> Floats:
-    """The maps side by side (h, w, 8), for who looks at one place of all; `planes` (4, h, w), the others (h, w)."""
-    height, width = smooth.shape
-    out = np.empty((height, width, 8), np.float32)
-    for y in range(height):
-        for x in range(width):
-            for k in range(4):
-                out[y, x, k] = planes[k, y, x]
-            out[y, x, 4] = smooth[y, x]
-            out[y, x, 5] = spots[y, x]
-            out[y, x, 6] = red_blobs[y, x]
-            out[y, x, 7] = green_blobs[y, x]
-    return out
-
-
-@njit(cache=True, fastmath=True)
 def blobs(plane: Floats, smooth: Floats, least: float, out: Bytes) -> None:
-    """1 where the product of two maps (h, w), averaged two by two, is above `least`, else 0; `out` (h/2, w/2)."""
-    quarter, least32 = np.float32(0.25), np.float32(least)
+    """1 where a colour on smooth ground, both (h, w), averaged two by two, is above `least`, else 0; `out` (h/2, w/2)."""
+    quarter, least32, some, more = np.float32(0.25), np.float32(least), np.float32(0.4), np.float32(0.6)
     for y in range(out.shape[0]):
         a, b, c, d = plane[2 * y], plane[2 * y + 1], smooth[2 * y], smooth[2 * y + 1]
         for x in range(out.shape[1]):
             i, j = 2 * x, 2 * x + 1
-            out[y, x] = (a[i] * c[i] + a[j] * c[j] + b[i] * d[i] + b[j] * d[j]) * quarter > least32
+            top = a[i] * (some + more * c[i]) + a[j] * (some + more * c[j])
+            bottom = b[i] * (some + more * d[i]) + b[j] * (some + more * d[j])
+            out[y, x] = (top + bottom) * quarter > least32
 
 
 @njit(cache=True)
@@ -79,27 +65,24 @@ def rise(brightness: Floats, around: Floats, whiteness: Floats, least: float, ou
 
 
 @njit(cache=True, fastmath=True)
-def bright_colours(maps: Floats, colours: Floats, sources: Floats) -> None:
-    """Both colour planes (2, h, w), and the same weighted by brightness: a ball's middle is brighter than its rim."""
-    for y in range(maps.shape[0]):
-        for x in range(maps.shape[1]):
-            weight = np.float32(0.35) + np.float32(0.65) * maps[y, x, 2]
-            for family in range(2):
-                colours[family, y, x] = maps[y, x, family]
-                sources[family, y, x] = maps[y, x, family] * weight
+def bright_colour(colour: Floats, brightness: Floats, source: Floats) -> None:
+    """A colour plane (h, w) weighted by brightness: a ball's middle is brighter than its rim."""
+    for y in range(colour.shape[0]):
+        for x in range(colour.shape[1]):
+            source[y, x] = colour[y, x] * (np.float32(0.35) + np.float32(0.65) * brightness[y, x])
 
 
 @njit(cache=True, fastmath=True)
 def halve(maps: Floats) -> Floats:
-    """The maps (h, w, n) at half their size."""
-    height, width, count = maps.shape[0] // 2, maps.shape[1] // 2, maps.shape[2]
-    out = np.empty((height, width, count), np.float32)
+    """The maps (n, h, w) at half their size."""
+    count, height, width = maps.shape[0], maps.shape[1] // 2, maps.shape[2] // 2
+    out = np.empty((count, height, width), np.float32)
     quarter = np.float32(0.25)
-    for y in range(height):
-        for x in range(width):
-            for k in range(count):
-                top = maps[2 * y, 2 * x, k] + maps[2 * y, 2 * x + 1, k]
-                out[y, x, k] = (top + maps[2 * y + 1, 2 * x, k] + maps[2 * y + 1, 2 * x + 1, k]) * quarter
+    for k in range(count):
+        for y in range(height):
+            top, bottom = maps[k, 2 * y], maps[k, 2 * y + 1]
+            for x in range(width):
+                out[k, y, x] = (top[2 * x] + top[2 * x + 1] + bottom[2 * x] + bottom[2 * x + 1]) * quarter
     return out
 
 
@@ -200,11 +183,11 @@ def outline(
 
 @njit(cache=True, fastmath=True)
 def zones(maps: Floats, u: float, v: float, edges: Floats, out: Floats) -> None:
-    """Means of the maps (h, w, n) over zones round (u, v); `out` (m, n), 0 where a zone has no pixel.
+    """Means of the maps (n, h, w) over zones round (u, v); `out` (m, n), 0 where a zone has no pixel.
 
     `edges` (m,) are the zones' outer radii [px], growing; the first zone is a disc.
     """
-    height, width, count = maps.shape
+    count, height, width = maps.shape
     zones_n = edges.shape[0]
     out[:] = 0
     pixels = np.zeros(zones_n, np.int32)
@@ -217,7 +200,7 @@ def zones(maps: Floats, u: float, v: float, edges: Floats, out: Floats) -> None:
                 if d <= edges[z] * edges[z]:
                     pixels[z] += 1
                     for k in range(count):
-                        out[z, k] += maps[y, x, k]
+                        out[z, k] += maps[k, y, x]
                     break
     for z in range(zones_n):
         if pixels[z] > 0:
@@ -238,9 +221,9 @@ def describe(
 ) -> None:
     """What the filters say of each point (n, 2: x, y) of one pyramid level, its circle's radius sought between `radii` [px].
 
-    `maps` (h, w, 8) are `core.perception.filters.MAPS`; `out` (n, FEATURES): `FEATURES`, but the radius [px] itself last.
+    `maps` (8, h, w) are `core.perception.filters.MAPS`; `out` (n, FEATURES): `FEATURES`, but the radius [px] itself last.
     """
-    within = np.zeros((5, maps.shape[2]), np.float32)
+    within = np.zeros((5, maps.shape[0]), np.float32)
     edges = np.zeros(5, np.float32)
     for i in range(points.shape[0]):
         u, v = float(points[i, 0]), float(points[i, 1])

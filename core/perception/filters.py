@@ -155,7 +155,7 @@ def stages(image: Image) -> dict[str, Image | Floats]:
     seen = Seen(image, weights.balance_norm, colour_table(weights.colour))
     pictures: dict[str, Image | Floats] = {"balanced": np.clip(seen.image * seen.gains, 0, 255).astype(np.uint8)}
     looked_at = ("smooth", "red", "green", "highlight", "area_red", "area_green")
-    pictures |= {name: np.ascontiguousarray(seen.maps[:, :, MAPS.index(name)]) for name in looked_at}
+    pictures |= {name: seen.maps[MAPS.index(name)] for name in looked_at}
     _, votes = circle_votes(seen.maps)
     for k, name in enumerate(FAMILIES):
         pictures[f"circles_{name}"] = np.minimum(votes[k], 1)
@@ -274,14 +274,14 @@ class Seen:
         values = np.clip(np.arange(256)[None] / 255 * self.gains[:, None], 0, 1)
         bins = np.minimum(values * BINS, BINS - 1).astype(np.int32)
         luma = (values * np.array(BGR_LUMA)[:, None]).astype(np.float32)
-        colours = np.empty((4, *self.image.shape[:2]), np.float32)
-        kernels.planes(self.image, bins, luma, table, _SHARES, colours)
-        self.red, green, brightness, whiteness = colours
-        smooth = smoothness(brightness)
-        smoothed = 0.4 + 0.6 * smooth
-        blobs = (areas(self.red, smoothed), areas(green, smoothed))
-        self.maps: Floats = kernels.packed(colours, smooth, highlights(brightness, whiteness), *blobs)
-        """(h, w, MAPS)"""
+        self.maps: Floats = np.empty((len(MAPS), *self.image.shape[:2]), np.float32)
+        """(MAPS, h, w)"""
+        red, green, brightness, whiteness, smooth, highlight, area_red, area_green = self.maps
+        kernels.planes(self.image, bins, luma, table, _SHARES, self.maps)
+        smoothness(brightness, smooth)
+        highlights(brightness, whiteness, highlight)
+        areas(red, smooth, area_red)
+        areas(green, smooth, area_green)
 
     def candidates(self) -> Iterator[Candidates]:
         """Where circles and colour agree, for each size and colour."""
@@ -290,7 +290,7 @@ class Seen:
             sources, votes = circle_votes(maps)
             for family in range(len(FAMILIES)):
                 yield self._level(maps, sources[family], votes[family], family, zoom)
-            if min(maps.shape[:2]) < 4 * RADII_PX[1]:
+            if min(maps.shape[1:]) < 4 * RADII_PX[1]:
                 break
             maps, zoom = kernels.halve(maps), zoom * 2
 
@@ -305,33 +305,37 @@ class Seen:
 
     def tints(self, circles: Floats) -> NDArray[np.float64]:
         """Log of red over green and of blue over green (n, 2) in the middles of circles (n, 3), balanced."""
-        b, g, r = (kernels.tints(self.image, self.red, circles * np.float32(self.scale), MIDDLE) / 255 * self.gains + 0.02).T
+        b, g, r = (
+            kernels.tints(self.image, self.maps[0], circles * np.float32(self.scale), MIDDLE) / 255 * self.gains + 0.02
+        ).T
         return np.asarray(np.log(np.stack([r / g, b / g], axis=1)), float)
 
 
-def smoothness(brightness: Floats) -> Floats:
-    """1 where brightness does not change, towards 0 at edges and veins (Sobel)."""
+def smoothness(brightness: Floats, out: Floats) -> None:
+    """1 where brightness does not change, towards 0 at edges and veins (Sobel); both (h, w)."""
     gx = cv2.Sobel(brightness, cv2.CV_32F, 1, 0)
     gy = cv2.Sobel(brightness, cv2.CV_32F, 0, 1)
-    return np.asarray(cv2.exp(cv2.magnitude(gx, gy) * (-1 / SOBEL_SOFT)), np.float32)
+    cv2.magnitude(gx, gy, magnitude=out)
+    out *= np.float32(-1 / SOBEL_SOFT)
+    cv2.exp(out, dst=out)
 
 
-def highlights(brightness: Floats, whiteness: Floats) -> Floats:
-    """1 on small white spots: brighter than all around by a step, and colourless."""
+def highlights(brightness: Floats, whiteness: Floats, out: Floats) -> None:
+    """1 on small white spots: brighter than all around by a step, and colourless; all (h, w)."""
     height, width = brightness.shape
     small = cv2.resize(brightness, (max(width // 4, 1), max(height // 4, 1)), interpolation=cv2.INTER_AREA)
     around = cv2.resize(cv2.blur(small, (7, 7)), (width, height), interpolation=cv2.INTER_LINEAR)
     step = np.empty_like(brightness)
     kernels.rise(brightness, np.asarray(around, np.float32), whiteness, HIGHLIGHT_STEP, step)
-    return np.asarray(cv2.dilate(step, _NEAR), np.float32)
+    cv2.dilate(step, _NEAR, dst=out)
 
 
 _NEAR = np.ones((3, 3), np.uint8)
 _SHARES = (np.arange(BINS)[:, None] / np.maximum(np.arange(BINS), 1)).astype(np.float32)
 
 
-def areas(plane: Floats, smooth: Floats) -> Floats:
-    """1 on blobs of smooth fruit colour whose area lies between the least and the largest."""
+def areas(plane: Floats, smooth: Floats, out: Floats) -> None:
+    """1 on blobs of smooth fruit colour whose area lies between the least and the largest; all (h, w)."""
     height, width = plane.shape
     small = np.empty((height // 2, width // 2), np.uint8)
     kernels.blobs(plane, smooth, BLOB_FROM, small)
@@ -339,17 +343,17 @@ def areas(plane: Floats, smooth: Floats) -> Floats:
     share = np.bincount(labels.ravel()) / labels.size
     wanted = ((share >= AREA_MIN) & (share <= AREA_MAX)).astype(np.float32)
     wanted[0] = 0
-    return np.asarray(cv2.resize(wanted[labels], (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    cv2.resize(wanted[labels], (width, height), dst=out, interpolation=cv2.INTER_LINEAR)
 
 
 def circle_votes(maps: Floats) -> tuple[Floats, Floats]:
     """Of each family the plane whose discs are looked for (colour, brighter in the middle), and the votes for their centres;
     both (2, h, w)."""
-    shape = (len(FAMILIES), *maps.shape[:2])
-    colours, sources, votes = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
-    kernels.bright_colours(maps, colours, sources)
+    shape = (len(FAMILIES), *maps.shape[1:])
+    sources, votes = np.empty(shape, np.float32), np.empty(shape, np.float32)
     smoothed = np.empty(shape[1:], np.float32)
-    for colour, source, vote in zip(colours, sources, votes, strict=True):
+    for colour, source, vote in zip(maps, sources, votes, strict=False):
+        kernels.bright_colour(colour, maps[2], source)
         cv2.GaussianBlur(source, (3, 3), 0.8, dst=source)
         kernels.vote(source, STEEP, *RADII_PX, vote)
         cv2.GaussianBlur(vote, (5, 5), 1.2, dst=smoothed)
