@@ -55,6 +55,15 @@ def is_free(port: int, host: str = "127.0.0.1") -> bool:
     return True
 
 
+def free_ports(count: int) -> list[int]:
+    """So many different ports of loopback that nobody uses now."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [sock.getsockname()[1] for sock in sockets]
+    for sock in sockets:
+        sock.close()
+    return ports
+
+
 def holder(port: int) -> str:
     """`pid 123 (python -m http.server)`; Linux only, and only what this user may see."""
     inodes = _listening_inodes(port)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-import socket
 import sys
 import tempfile
 import time
@@ -21,6 +20,7 @@ from random import Random
 from statistics import median
 from typing import Any
 
+from console.ports import free_ports
 from core.allocation.bidding import DOCKING_S, UNDOCKING_S, Condition, Stop, offer, work_s
 from core.allocation.plant_side import Market
 from core.allocation.plant_state import Solicit
@@ -154,7 +154,7 @@ async def service_rows(robots: int, plants: int, rate: float = RATE) -> list[Row
     places = dict(zip([*names[0], *names[1]], [*drawn.starts, *drawn.plants], strict=True))
     peers = [
         Peer(id=id, kind="robot" if id in names[0] else "plant", url=f"http://127.0.0.1:{port}")
-        for id, port in zip(places, _free_ports(len(places)), strict=True)
+        for id, port in zip(places, free_ports(len(places)), strict=True)
     ]
     told = [peer.model_dump() for peer in peers]
     epoch_s = time.time()
@@ -248,15 +248,6 @@ async def _line(process: asyncio.subprocess.Process) -> Row:
         raise GardenError("a process of the market ended early", hint="its last words are on standard error")
     told: Row = json.loads(line)
     return told
-
-
-def _free_ports(count: int) -> list[int]:
-    """So many ports that nobody uses now."""
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [sock.getsockname()[1] for sock in sockets]
-    for sock in sockets:
-        sock.close()
-    return ports
 
 
 # ------------------------------------------------------------------------------------------------- rows

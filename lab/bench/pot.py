@@ -11,7 +11,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import statistics
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+from console.ports import free_ports
 from core.clock import WallClock
 from core.mesh.auth import Enrolled, make_garden
 from sim.devices.bench_firmata import bench_emulator
@@ -118,7 +118,7 @@ async def running_pot(folder: Path, more: Mapping[str, str]) -> AsyncIterator[di
     board = EmulatorHost(bench_emulator(1), WallClock())
     server = await board.serve_tcp("127.0.0.1", 0)
     firmware = asyncio.create_task(board.run())
-    port = _free_port()
+    (port,) = free_ports(1)
     began = time.perf_counter()
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "plant_service",
@@ -180,7 +180,7 @@ async def _peer(folder: Path) -> Any:
     if lighttpd is None or php is None:
         yield None
         return
-    home, port = folder / "peer", _free_port()
+    home, (port,) = folder / "peer", free_ports(1)
     home.mkdir()
     (home / "inventory.json").write_text('{"fruits":[]}')
     (home / "index.php").write_text(_PHP % (home / "inventory.json"))
@@ -233,13 +233,6 @@ def _rss_mb(pid: int) -> float:
         if line.startswith("VmRSS"):
             return int(line.split()[1]) / 1024
     return float("nan")
-
-
-def _free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 def _row(name: str, seen: dict[str, list[float]], verb: str, n: int, bar: float | None, unit: str = "1/s") -> Row:
