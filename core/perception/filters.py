@@ -32,6 +32,7 @@ BINS = 32
 """Of each channel in the colour table."""
 BRIGHTNESS = 0.42
 """What the balanced image's generalised mean is brought to, 1 being white."""
+BALANCED_EVERY_PX = 6
 GAIN_RANGE = (0.4, 4.0)
 BGR_LUMA = (0.114, 0.587, 0.299)
 SOBEL_SOFT = 0.35
@@ -198,17 +199,25 @@ def together(candidates: list[Candidates], family: int) -> Candidates:
 
 
 def confidence_of(candidates: Candidates, weights: Weights) -> NDArray[np.float64]:
-    """The collective estimate (n,): a logistic function of the weighted sum of what the filters say."""
+    """The collective estimate (n,): a logistic function of the weighted sum of what the filters say (`terms`, summed as a
+    quadratic form)."""
     k = candidates.family
-    x = terms((candidates.features - weights.centre[k]) / weights.spread[k])
-    return _logistic(weights.candidate[k, 0] + x @ weights.candidate[k, 1:])
+    x = _within_reason((candidates.features - weights.centre[k]) / weights.spread[k])
+    bias, gains, count = weights.candidate[k, 0], weights.candidate[k, 1:], x.shape[1]
+    in_pairs = np.zeros((count, count))
+    in_pairs[_pairs(count)] = gains[count:]
+    return _logistic(bias + x @ gains[:count] + np.einsum("ij,ij->i", x @ in_pairs, x))
 
 
 def terms(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Normalised features (n, f) and their products in pairs (n, f + f (f + 1) / 2), within reason."""
-    x = np.clip(x, -4, 4)
+    x = _within_reason(x)
     a, b = _pairs(x.shape[1])
     return np.concatenate([x, x[:, a] * x[:, b]], axis=1)
+
+
+def _within_reason(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.clip(x, -4, 4)
 
 
 @functools.cache
@@ -257,7 +266,7 @@ def colour_table(colour: NDArray[np.float64]) -> Floats:
 def gains_of(image: Image, norm: float) -> NDArray[np.float64]:
     """Factors (3,) that make the image's generalised mean grey (shades of grey: Finlayson and Trezzi 2004)."""
     powers = (np.arange(256) / 255) ** norm
-    mean = np.maximum(powers[image[::6, ::6].reshape(-1, 3)].mean(axis=0) ** (1 / norm), 1e-3)
+    mean = np.maximum(kernels.means(image, BALANCED_EVERY_PX, powers) ** (1 / norm), 1e-3)
     level = BRIGHTNESS + 0.15 * (1 - 1 / norm)
     return np.asarray(np.clip(level / mean, *GAIN_RANGE), float)
 
@@ -339,11 +348,10 @@ def areas(plane: Floats, smooth: Floats, out: Floats) -> None:
     height, width = plane.shape
     small = np.empty((height // 2, width // 2), np.uint8)
     kernels.blobs(plane, smooth, BLOB_FROM, small)
-    _, labels = cv2.connectedComponents(small, connectivity=4)
-    share = np.bincount(labels.ravel()) / labels.size
-    wanted = ((share >= AREA_MIN) & (share <= AREA_MAX)).astype(np.float32)
-    wanted[0] = 0
-    cv2.resize(wanted[labels], (width, height), dst=out, interpolation=cv2.INTER_LINEAR)
+    count, labels = cv2.connectedComponents(small, connectivity=4)
+    wanted = np.empty(small.shape, np.float32)
+    kernels.of_area(np.asarray(labels, np.int32), count, AREA_MIN, AREA_MAX, wanted)
+    cv2.resize(wanted, (width, height), dst=out, interpolation=cv2.INTER_LINEAR)
 
 
 def circle_votes(maps: Floats) -> tuple[Floats, Floats]:
@@ -351,12 +359,9 @@ def circle_votes(maps: Floats) -> tuple[Floats, Floats]:
     both (2, h, w)."""
     shape = (len(FAMILIES), *maps.shape[1:])
     sources, votes = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    smoothed = np.empty(shape[1:], np.float32)
+    cast = np.empty(shape[1:], np.float32)
     for colour, source, vote in zip(maps, sources, votes, strict=False):
-        kernels.bright_colour(colour, maps[2], source)
-        cv2.GaussianBlur(source, (3, 3), 0.8, dst=source)
-        kernels.vote(source, STEEP, *RADII_PX, vote)
-        cv2.GaussianBlur(vote, (5, 5), 1.2, dst=smoothed)
-        cv2.blur(colour, (5, 5), dst=vote)
-        cv2.addWeighted(smoothed, 4.0, vote, 0.5, 0.0, dst=vote)
+        kernels.bright_colour(colour, maps[kernels.BRIGHTNESS], source)
+        kernels.vote(source, STEEP, *RADII_PX, cast)
+        kernels.agreement(cast, colour, vote)
     return sources, votes

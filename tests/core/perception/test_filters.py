@@ -140,6 +140,44 @@ def test_balancing_makes_the_mean_grey():
     assert np.ptp(balanced) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_circles_and_colour_agree_as_gaussian_and_box_say():
+    rng = np.random.default_rng(11)
+    votes, colour = rng.random((2, 37, 52), np.float32)
+    agreed = np.empty_like(votes)
+    kernels.agreement(votes, colour, agreed)
+    expected = 4 * cv2.GaussianBlur(votes, (5, 5), 1.2) + 0.5 * cv2.blur(colour, (5, 5))
+    assert agreed == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_bright_colour_is_blurred_as_a_gaussian_says():
+    colour, brightness = np.random.default_rng(12).random((2, 37, 52), np.float32)
+    soft = np.empty_like(colour)
+    kernels.bright_colour(colour, brightness, soft)
+    assert soft == pytest.approx(cv2.GaussianBlur(colour * (0.35 + 0.65 * brightness), (3, 3), 0.8), abs=1e-5)
+
+
+def test_tops_are_the_highest_of_their_neighbours_and_come_best_first():
+    votes = np.random.default_rng(13).random((40, 61), np.float32)
+    votes[0, 0] = votes[39, 60] = 2.0
+    tops = kernels.tops(votes, 0.6, 1000)
+    highest = (votes >= cv2.dilate(votes, np.ones((5, 5), np.uint8))) & (votes >= 0.6)
+    assert {(x, y) for x, y in tops.tolist()} == {(x, y) for y, x in np.argwhere(highest).tolist()}
+    heights = votes[tops[:, 1], tops[:, 0]].tolist()
+    assert heights == sorted(heights, reverse=True)
+    assert kernels.tops(votes, 0.6, 3).tolist() == tops[:3].tolist()
+
+
+def test_the_collective_estimate_is_the_weighted_sum_of_all_terms():
+    weights = filters.packaged()
+    features = np.random.default_rng(14).normal(0, 2, (9, len(filters.FEATURES))).astype(np.float32)
+    for family in range(2):
+        terms = filters.terms((features - weights.centre[family]) / weights.spread[family])
+        odds = weights.candidate[family, 0] + terms @ weights.candidate[family, 1:]
+        circles = np.zeros((9, 3), np.float32)
+        estimate = filters.confidence_of(filters.Candidates(family, circles, features), weights)
+        assert estimate == pytest.approx(1 / (1 + np.exp(-np.clip(odds, -30, 30))), abs=1e-9)
+
+
 def test_weights_survive_their_file():
     weights = filters.packaged()
     again = filters.Weights.of(weights.document())
