@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from core.errors import Overtaken
 from core.mesh.client import Answer
@@ -13,19 +13,25 @@ from core.wire.market import BID_WINDOW_S, Bid, BidRound, Task
 from lab.soak.case import Case
 from lab.soak.net import Message
 
-BIDS_KEPT = 40
-ONE_ROUND_S = 1.0
-"""Bids that were asked for within so short a time belong to one round."""
+QUESTIONS_KEPT = 8
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Heard:
     """A bid that came to its plant."""
 
-    sent_s: float
-    heard_s: float
+    at_s: float
     robot_id: str
-    cost_s: float | None
+    cost_s: float
+
+
+@dataclass(slots=True)
+class _Question:
+    """The same words to every robot, sent at one moment: a round."""
+
+    left_s: float
+    words: bytes
+    heard: list[_Heard] = field(default_factory=list)
 
 
 class Awards:
@@ -33,9 +39,10 @@ class Awards:
 
     def __init__(self, case: Case) -> None:
         self._case = case
-        self._asked: dict[int, float] = {}
-        """When a question for a bid came to its robot, by the message's number."""
-        self._bids: defaultdict[str, deque[_Heard]] = defaultdict(lambda: deque(maxlen=BIDS_KEPT))
+        self._asked: dict[int, _Question] = {}
+        """By the message's number, until its answer has come."""
+        self._questions: defaultdict[str, deque[_Question]] = defaultdict(lambda: deque(maxlen=QUESTIONS_KEPT))
+        """A task's latest."""
         self._rounds: set[tuple[str, int]] = set()
         self._lives: dict[str, object] = {}
 
@@ -54,16 +61,20 @@ class Awards:
             self._case.declined.add((award["announcement"]["task_id"], award["epoch"]))
 
     def asked(self, message: Message) -> None:
-        """A robot is asked for a bid."""
-        self._asked[message.number] = self._case.truth.now()
+        """A question for a bid leaves its plant."""
+        questions = self._questions[json.loads(message.body)["task_id"]]
+        now_s = self._case.truth.now()
+        if not questions or (questions[-1].left_s, questions[-1].words) != (now_s, message.body):
+            questions.append(_Question(now_s, message.body))
+        self._asked[message.number] = questions[-1]
 
     def heard(self, message: Message, answer: Answer) -> None:
         """A robot's answer has come to its plant."""
-        sent_s = self._asked.pop(message.number, self._case.truth.now())
-        if answer.status == 200:
-            bid = json.loads(answer.body)
-            heard = _Heard(sent_s, self._case.truth.now(), message.target, bid["cost_s"])
-            self._bids[bid["task_id"]].append(heard)
+        question = self._asked.pop(message.number, None)
+        if question is not None and answer.status == 200:
+            cost_s = json.loads(answer.body)["cost_s"]
+            offer_s = math.inf if cost_s is None else cost_s
+            question.heard.append(_Heard(self._case.truth.now(), message.target, offer_s))
 
     def read(self, plant_id: str, task: Task) -> None:
         """I10: the rounds of a task as they are on disk."""
@@ -86,15 +97,14 @@ class Awards:
             case.breach("I10", f"{task.task_id} went to {entry.winner} at {won.cost_s:.1f} s, not to {best.robot_id}")
         counted = {bid.robot_id for bid in offers}
         for heard in self._came(task.task_id, case.loop_s(plant_id, entry.t_s)):
-            cost_s = math.inf if heard.cost_s is None else heard.cost_s
-            if (cost_s, heard.robot_id) < _price(won) and heard.robot_id not in counted:
-                case.breach("I10", f"{task.task_id} went to {entry.winner}, though {heard.robot_id} offered {cost_s:.1f} s")
+            if (heard.cost_s, heard.robot_id) < _price(won) and heard.robot_id not in counted:
+                offer = f"{heard.robot_id} offered {heard.cost_s:.1f} s"
+                case.breach("I10", f"{task.task_id} went to {entry.winner}, though {offer}")
 
     def _came(self, task_id: str, closed_s: float) -> list[_Heard]:
-        """The bids that were asked for in the round that closed then, and that came in time."""
-        sent = [h for h in self._bids[task_id] if closed_s - BID_WINDOW_S - 0.1 <= h.sent_s <= closed_s]
-        newest_s = max((h.sent_s for h in sent), default=0.0)
-        return [h for h in sent if h.sent_s >= newest_s - ONE_ROUND_S and h.heard_s <= closed_s - 0.005]
+        """The bids of the round that closed then, as far as they came in time."""
+        asked = [q for q in self._questions[task_id] if closed_s - BID_WINDOW_S - 0.1 <= q.left_s <= closed_s]
+        return [heard for heard in asked[-1].heard if heard.at_s <= closed_s - 0.005] if asked else []
 
     def _same_life(self, plant_id: str) -> bool:
         life = self._case.garden.running[plant_id].life

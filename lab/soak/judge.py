@@ -41,7 +41,8 @@ class Judge:
 
     def attach(self, garden: SoakGarden) -> None:
         self._case.garden = garden
-        garden.mesh.arrived, garden.mesh.answered, garden.mesh.heard = self._arrived, self._answered, self._heard
+        mesh = garden.mesh
+        mesh.sent, mesh.arrived, mesh.answered, mesh.heard = self._sent, self._arrived, self._answered, self._heard
         self._case.gremlin.halted, self._case.truth.began = self.acts.halted, self.acts.began
 
     def ended_itself(self, name: str, why: str) -> None:
@@ -64,6 +65,10 @@ class Judge:
 
     # Messages
 
+    def _sent(self, message: Message) -> None:
+        if message.path == "/bids":
+            self.awards.asked(message)
+
     def _arrived(self, message: Message) -> None:
         if message.method == "PATCH":
             self.papers.arrived(message)
@@ -71,8 +76,6 @@ class Judge:
             return
         if message.path == "/tasks" and message.target.startswith("robot"):
             self.awards.awarded(message)
-        elif message.path == "/bids":
-            self.awards.asked(message)
         elif message.path == "/resume":
             self._case.stopped.discard(message.target)
 

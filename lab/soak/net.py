@@ -70,6 +70,8 @@ class SoakMesh:
         self.requests = 0
         self.touched: Callable[[Message], None] = lambda message: None
         """A fault met a message."""
+        self.sent: Callable[[Message], None] = lambda message: None
+        """A node asks; whether that arrives is not known yet."""
         self.arrived: Callable[[Message], None] = lambda message: None
         self.answered: Callable[[Message, Answer], None] = lambda message, answer: None
         """The answer has left the node that gave it."""
@@ -97,6 +99,7 @@ class SoakMesh:
         self.requests += 1
         message = Message(self.requests, life.name, target, method, path, body, headers.get("idempotency-key", ""))
         done: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self.sent(message)
         if self.worst(message, None):
             return await done
         held_s = self.held_s(message)
