@@ -8,7 +8,6 @@ from urllib.parse import parse_qs, urlsplit
 from core import soil
 from core.allocation import permits
 from core.allocation.docks import Docks, DocksDocument
-from core.allocation.tasks import gave_up
 from core.clock import Clock
 from core.errors import DriverError, Refused, StorageError, Unavailable, Unprocessable
 from core.soil import Limits, ProbeState, Reading
@@ -251,8 +250,7 @@ class Pot:
         return self._thirsty and able and enough and now_s >= self._ask_again_s()
 
     def _ask_again_s(self) -> float:
-        failed = [t.updated_s for t in self.place.market.tasks() if t.kind == "water" and gave_up(t)]
-        return max(failed, default=-THIRST_AGAIN_S) + THIRST_AGAIN_S
+        return self.place.market.gave_up_s("water") + THIRST_AGAIN_S
 
     async def _ask(self) -> None:
         care = self.care.machine.settings

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from starlette.responses import Response
 
 from core.allocation.picking import may_be_picked
-from core.allocation.tasks import gave_up
 from core.clock import Clock
 from core.errors import Conflict, Refused
 from core.growth.forecast import forecast, uncertainty
@@ -159,8 +158,7 @@ class Tending:
             await self._ask_own("harvest", f"{len(fruits)} ripe fruit", [fruit.fruit_id for fruit in fruits], len(fruits))
 
     async def _ask_own(self, kind: str, why: str, fruit_ids: Sequence[str], count: int) -> None:
-        failed_s = [t.updated_s for t in self._place.market.tasks() if t.kind == kind and gave_up(t)]
-        if failed_s and self._clock.now() < max(failed_s) + AFTER_FAILURE_S:
+        if self._clock.now() < self._place.market.gave_up_s(kind) + AFTER_FAILURE_S:
             return
         try:
             await self._place.change(

@@ -276,11 +276,12 @@ class Market(TaskBook):
     # What the task book asks
 
     def _blocked_until_s(self, task: Task) -> float:
-        """While a permit is open no robot need come: it could not act. A doubt is settled by a scan before anything.
+        """While a permit is open, or the soil cannot be measured, no robot need come: it could not act.
 
-        One harvest after the other: there is one dock, and two robots would be in each other's way.
+        A doubt is settled by a scan before anything. One harvest after the other: there is one dock, and two robots would be
+        in each other's way.
         """
-        if task.kind == "water" and self._water.open is not None:
+        if task.kind == "water" and (self._water.open is not None or self._water.soil.ratio is None):
             return math.inf
         if task.kind == "harvest" and (self._picks.doubts or self._picks.open is not None or self._being_harvested()):
             return math.inf

@@ -30,6 +30,7 @@ class TaskBook:
             self._tasks[task.task_id] = _in_new_time(task, now_s)
         self._live = {task.task_id: Live.revived(task, now_s, self.rules) for task in self.open_tasks()}
         self._rounds = 0
+        self._gave_up_s: dict[str, float] = {}
         self._effects: list[Effect] = []
         self.dirty = True
 
@@ -60,7 +61,7 @@ class TaskBook:
         self._kill(task)
         who = f"{task.robot_id} had it in its queue" if task.robot_id else self._live[task.task_id].told
         why = f"not begun within {(task.deadline_s or now_s) - task.created_s:g} s, its deadline"
-        self._finish(task, "failed", f"{why}: {who}" if who else why, now_s)
+        self._finish(task, "missed", f"{why}: {who}" if who else why, now_s)
 
     def _details(self, task: Task) -> dict[str, Any]:
         """What an announcement tells beside the task itself."""
@@ -83,6 +84,11 @@ class TaskBook:
         mine = owner in ("", self.card.plant_id)
         hint = "GET /tasks lists what is known here" if mine else f"ids tell their plant: ask {owner}"
         raise NotFound(f"{self.card.plant_id} has no task {task_id}", hint=hint)
+
+    def gave_up_s(self, kind: str) -> float:
+        """When such a task last failed at its own work: deadlines say nothing against asking again, nor does what was before
+        a restart, for somebody may have mended it. Minus infinity when none did."""
+        return self._gave_up_s.get(kind, -math.inf)
 
     def due_s(self) -> float:
         """When `tick` is next worth calling."""
@@ -282,7 +288,11 @@ class TaskBook:
         if task.robot_id:
             self._effects.append(Kill(task.robot_id, task.task_id, task.epoch))
 
-    def _finish(self, task: Task, state: str, reason: str, now_s: float) -> Task:
+    def _finish(self, task: Task, end: Literal["done", "failed", "missed", "cancelled"], reason: str, now_s: float) -> Task:
+        """`missed`: it failed by its deadline alone."""
+        if end == "failed":
+            self._gave_up_s[task.kind] = now_s
+        state = "failed" if end == "missed" else end
         del self._live[task.task_id]
         task = self._put(task, now_s, state=state, phase="", reason=reason[:500])
         self._event(task, f"{state}: {reason}", now_s)
@@ -313,12 +323,6 @@ class TaskBook:
         entry = TaskEvent(t_s=now_s, what=what[:500], robot_id=task.robot_id, epoch=task.epoch)
         self._put(task, now_s, events=[*task.events, entry][-self.rules.events_kept :])
         self._effects.append(Note(task.state, what[:500], task.task_id, task.robot_id))
-
-
-def gave_up(task: Task) -> bool:
-    """It failed at its own work; one that merely missed its deadline says nothing against asking again."""
-    missed = task.deadline_s is not None and task.permits == 0 and task.updated_s >= task.deadline_s
-    return task.state == "failed" and not missed
 
 
 def _begin_by_s(task: Task) -> float:

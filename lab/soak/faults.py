@@ -45,7 +45,7 @@ WORST = {
 """Chance that just this message is lost, while faults are on."""
 FATAL = {
     "death_after_act": 0.10, "death_before_act": 0.05, "crash_after_permit": 0.05, "crash_after_award": 0.05,
-    "crash_on_end": 0.05, "crash_writing_award": 0.06, "crash_writing_permit": 0.10, "pause_under_permit": 0.04,
+    "crash_on_end": 0.05, "crash_writing_award": 0.06, "crash_writing_permit": 0.10, "pause_under_permit": 0.10,
     "permit_lost_in_crash": 0.06, "permit_asked_late": 0.06, "power_cycle_while_stopped": 0.3,
 }  # fmt: skip
 """Chance that a process dies, or sleeps, at this instant."""
@@ -86,7 +86,7 @@ class Gremlin:
     def attach(self, garden: SoakGarden) -> None:
         self.garden = garden
         garden.mesh.worst = self._worst
-        garden.mesh.touched, garden.mesh.held_s = self._cross, self._held_s
+        garden.mesh.touched, garden.mesh.held_s, garden.mesh.at_hand = self._cross, self._held_s, self._at_hand
 
     def touch(self, *names: str) -> None:
         now_s = self.truth.now()
@@ -219,19 +219,27 @@ class Gremlin:
                 self.garden.start(name)
 
     async def _pause(self, name: str = "", seconds: float = 0.0) -> None:
-        name = name or self.rng.choice(self._nodes())
+        name, seconds = name or self.rng.choice(self._nodes()), seconds or self.rng.choice(PAUSE_S)
+        if self._falls_asleep(name, seconds):
+            await self._sleeps(name, seconds)
+
+    def _falls_asleep(self, name: str, seconds: float) -> bool:
+        """At this very instant; not when it is dead or asleep already."""
         running = self.garden.running.get(name)
         if running is None or running.life.stopped:
-            return
-        seconds = seconds or self.rng.choice(PAUSE_S)
+            return False
         self.strike("pause_beyond_lease" if seconds > LEASE_S else "pause", name)
         running.life.stopped = True
         if running.process.kind == "robot":
             self.halted(name)
+        return True
+
+    async def _sleeps(self, name: str, seconds: float) -> None:
+        life = self.garden.running[name].life
         await asyncio.sleep(seconds)
         self.touch(name)
-        if running.life.stopped:
-            running.life.go_on()
+        if life.stopped:
+            life.go_on()
 
     async def _battery(self) -> None:
         body = self.truth.look(self.rng.choice(self.garden.names("robot")))
@@ -372,9 +380,15 @@ class Gremlin:
             self._later(self.crash(plant_id, "crash_after_permit"))
         if self._chance(FATAL["death_before_act"]):
             self._later(self.crash(robot_id, "death_before_act"))
-        if self._chance(FATAL["pause_under_permit"]):
+
+    def _at_hand(self, message: Message, answer: Answer) -> None:
+        """A robot falls asleep with a permit in its hand, often until that has run out."""
+        if not self.on or _named(message, answer) != "permit_reply_lost" or not self._chance(FATAL["pause_under_permit"]):
+            return
+        seconds = self.rng.choice(PAUSE_S[2:])
+        if self._falls_asleep(message.source, seconds):
             self.counts["pause_under_permit"] += 1
-            self._later(self._pause(robot_id))
+            self._later(self._sleeps(message.source, seconds))
 
     def _held_s(self, message: Message) -> float:
         """A robot falls asleep as it asks for a permit, and the question comes when its lease has long ended."""

@@ -81,6 +81,8 @@ class SoakMesh:
         """Asked of every request, and of every answer: whether just this one is lost."""
         self.held_s: Callable[[Message], float] = lambda message: 0.0
         """Asked of every request: how long just this one is kept on its way."""
+        self.at_hand: Callable[[Message, Answer], None] = lambda message, answer: None
+        """The answer has come, and who asked has not read it yet."""
 
     def attach(self, name: str, netloc: str, life: Life, app: Asgi) -> None:
         self._hosts[netloc] = Host(life, app)
@@ -159,6 +161,7 @@ class SoakMesh:
     def _bring(self, message: Message, answer: Answer, done: asyncio.Future[Answer]) -> None:
         if not done.done():
             self.heard(message, answer)
+            self.at_hand(message, answer)
             done.set_result(answer)
 
 

@@ -237,6 +237,30 @@ def test_no_permit_after_the_lease_nor_without_a_measurement() -> None:
         made.permit(task_id, request(), "", 1.0)
 
 
+def test_a_failed_task_is_remembered_until_a_restart_and_not_over_it() -> None:
+    made = market()
+    made.ask("water", 150.0, "soil", "dry", 0.0)
+    assert made.gave_up_s("water") == -math.inf
+    made.limits.day_cap_ml = 0.0
+    made.tick(5.0, ROBOTS)
+    assert [task.state for task in made.tasks()] == ["failed"]
+    assert made.gave_up_s("water") == 5.0
+    assert made.gave_up_s("harvest") == -math.inf
+    assert market(made.document(), now_s=6.0).gave_up_s("water") == -math.inf
+
+
+def test_nobody_is_asked_to_water_while_the_soil_cannot_be_measured() -> None:
+    made = market()
+    made.ask("water", 150.0, "operator", "by hand", 0.0)
+    made.soil(None, "open", 1.0)
+    made.tick(5.0, ROBOTS)
+    assert [e for e in made.take_effects() if isinstance(e, Solicit)] == []
+    made.soil(0.15, "", 6.0)
+    assert made.due_s() <= 6.0
+    made.tick(6.0, ROBOTS)
+    assert [e.robots for e in made.take_effects() if isinstance(e, Solicit)] == [ROBOTS]
+
+
 def test_the_day_cap_cuts_the_dose_and_then_refuses() -> None:
     made = market()
     made.limits.day_cap_ml = 100.0
