@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec import structs
 
 from core.clock import VirtualClock
 from core.errors import LinkDown
@@ -153,7 +154,7 @@ class Brain:
         while not self.closed:
             if self.wish is not None:
                 self._seq += 1
-                self.link.write(encode(replace(self.wish, seq=self._seq)))
+                self.link.write(encode(structs.replace(self.wish, seq=self._seq)))
             await self._clock.sleep(0.025)
 
 

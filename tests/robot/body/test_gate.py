@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from core.manipulation.arm import Joints
 from core.robots import gardener
@@ -84,7 +85,7 @@ def test_nothing_moves_at_all(setpoint: Setpoint, change: dict[str, object], why
 @pytest.mark.parametrize("field", ["v_mps", "omega_radps", "arm_s", "dose_ml", "gripper_m"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_number_that_is_not_finite_moves_nothing(field: str, value: float) -> None:
-    assert "not finite" in refused(replace(DRIVE, **{field: value}), GOOD)  # type: ignore[arg-type]
+    assert "not finite" in refused(structs.replace(DRIVE, **{field: value}), GOOD)  # type: ignore[arg-type]
     assert "not finite" in refused(Setpoint(seq=1, arm=(0.0, value, 0.0, 0.0)), GOOD)
 
 
@@ -109,7 +110,7 @@ def test_with_the_arm_out_or_unknown_only_slowly(state: GateState) -> None:
 
 
 def test_the_arm_may_not_swing_out_at_speed_but_then_the_base_stops_and_the_arm_moves() -> None:
-    verdict = check(replace(DRIVE, arm=OUT, arm_s=3.0), GOOD, NOW_S)
+    verdict = check(structs.replace(DRIVE, arm=OUT, arm_s=3.0), GOOD, NOW_S)
     assert (verdict.command.base, verdict.command.arm) == ("stop", OUT)
     assert "arm is out" in verdict.refusal
 
@@ -125,7 +126,7 @@ def test_speeds_beyond_the_limits_are_scaled_down_and_curvature_is_kept() -> Non
 def test_speed_is_gained_gently_and_lost_at_once() -> None:
     still = replace(GOOD, v_mps=0.0)
     assert check(DRIVE, still, NOW_S).command.v_mps == pytest.approx(0.02)
-    assert check(replace(DRIVE, v_mps=0.0), GOOD, NOW_S).command.v_mps == 0.0
+    assert check(structs.replace(DRIVE, v_mps=0.0), GOOD, NOW_S).command.v_mps == 0.0
     assert check(BACK, GOOD, NOW_S).command.v_mps == pytest.approx(-0.02)
     assert check(DRIVE, replace(still, dt_s=100.0), NOW_S).command.v_mps <= 0.1
 
@@ -136,9 +137,9 @@ def test_a_joint_out_of_range_is_refused_by_name(arm: Joints) -> None:
 
 
 def test_a_refused_arm_does_not_hold_up_the_base() -> None:
-    verdict = check(replace(DRIVE, arm=(9.0, 0.0, 0.0, 0.0)), replace(GOOD, arm_rad=gardener.ARM_HOME_RAD), NOW_S)
+    verdict = check(structs.replace(DRIVE, arm=(9.0, 0.0, 0.0, 0.0)), replace(GOOD, arm_rad=gardener.ARM_HOME_RAD), NOW_S)
     assert verdict.command.arm is None
-    slow = check(replace(BACK, arm=(9.0, 0.0, 0.0, 0.0)), replace(GOOD, v_mps=-0.05), NOW_S)
+    slow = check(structs.replace(BACK, arm=(9.0, 0.0, 0.0, 0.0)), replace(GOOD, v_mps=-0.05), NOW_S)
     assert (slow.command.base, slow.command.arm) == ("drive", None)
 
 
@@ -161,19 +162,19 @@ def test_a_gripper_opening_out_of_range_is_refused(opening_m: float) -> None:
 @pytest.mark.parametrize(
     ("setpoint", "change", "why"),
     [
-        (replace(PUMP, permit_id=""), {}, "permit"),
+        (structs.replace(PUMP, permit_id=""), {}, "permit"),
         (PUMP, {"docked": False}, "docked"),
         (PUMP, {"v_mps": 0.1}, "base stands"),
         (PUMP, {"arm_moving": True}, "arm stands"),
         (PUMP, {"arm_rad": None}, "place is known"),
         (PUMP, {"tank_ml": 2.0}, "tank is empty"),
-        (replace(PUMP, dose_ml=0.0), {}, "more than nothing"),
-        (replace(PUMP, dose_ml=-5.0), {}, "more than nothing"),
+        (structs.replace(PUMP, dose_ml=0.0), {}, "more than nothing"),
+        (structs.replace(PUMP, dose_ml=-5.0), {}, "more than nothing"),
         (PUMP, {"dose": Dose(used=True)}, "spent"),
         (PUMP, {"dose": Dose(refusal="the cap is reached")}, "cap"),
         (PUMP, {"dose": Dose(debited_ml=50.0, delivered_ml=50.0)}, "delivered"),
-        (replace(PUMP, dose_ml=80.0), {"dose": Dose(debited_ml=50.0, delivered_ml=50.0)}, "delivered"),
-        (replace(PUMP, dose_ml=20.0), {"dose": Dose(debited_ml=50.0, delivered_ml=20.0)}, "delivered"),
+        (structs.replace(PUMP, dose_ml=80.0), {"dose": Dose(debited_ml=50.0, delivered_ml=50.0)}, "delivered"),
+        (structs.replace(PUMP, dose_ml=20.0), {"dose": Dose(debited_ml=50.0, delivered_ml=20.0)}, "delivered"),
     ],
 )
 def test_the_pump_is_refused(setpoint: Setpoint, change: dict[str, object], why: str) -> None:
@@ -181,7 +182,7 @@ def test_the_pump_is_refused(setpoint: Setpoint, change: dict[str, object], why:
 
 
 def test_driving_and_pumping_at_once_drives_only() -> None:
-    verdict = check(replace(PUMP, base="drive", v_mps=-0.05), replace(IN_HAND, v_mps=-0.05), NOW_S)
+    verdict = check(structs.replace(PUMP, base="drive", v_mps=-0.05), replace(IN_HAND, v_mps=-0.05), NOW_S)
     assert (verdict.command.base, verdict.command.pump) == ("drive", False)
 
 

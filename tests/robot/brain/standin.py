@@ -9,9 +9,10 @@ import asyncio
 import math
 import random
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from fastapi import FastAPI
+from msgspec import structs
 
 from core.allocation.docks import Docks
 from core.clock import VirtualClock
@@ -288,7 +289,7 @@ class StandInBody:
             return
         self.states += 1
         now_s = self.clock.now()
-        marker = self.marker and replace(self.marker, age_s=now_s - self._marker_s)
+        marker = self.marker and structs.replace(self.marker, age_s=now_s - self._marker_s)
         state = BodyState(
             stamp_s=now_s,
             left_m=self.left_m,
