@@ -38,6 +38,8 @@ class Papers:
         self._created: defaultdict[str, set[str]] = defaultdict(set)
         """Tasks by plant that were acknowledged and not yet looked for on disk."""
         self._boot: defaultdict[str, int] = defaultdict(int)
+        self._met_before: defaultdict[str, int] = defaultdict(int)
+        """Faults when a plant's tasks were last looked at: what is new then may have met all since."""
         self._documents: dict[str, MarketDocument] = {}
         self._inventories: dict[str, Inventory] = {}
         self._generation: defaultdict[str, int] = defaultdict(int)
@@ -81,6 +83,7 @@ class Papers:
         if self._documents.get(plant_id) is not document:
             self._documents[plant_id] = document
             self._market(plant_id, pot, document)
+        self._met_before[plant_id] = self._faults(plant_id)
         if self._inventories.get(plant_id) is not pot.tending._fruits.machine.inventory:
             self._inventories[plant_id] = pot.tending._fruits.machine.inventory
             self._fruits(plant_id, pot, pot.tending._fruits.machine.inventory)
@@ -106,7 +109,7 @@ class Papers:
     def _task(self, plant_id: str, task: Task) -> None:
         case = self._case
         if (seen := self._seen.get(task.task_id)) is None:
-            seen = self._seen[task.task_id] = _Seen(task.epoch, task.state, self._faults(plant_id, task.task_id))
+            seen = self._seen[task.task_id] = _Seen(0, "announced", self._met_before[plant_id])
             case.born_s[task.task_id] = case.truth.now()
             case.tally.tasks += 1
             case.tally.by_kind[task.kind] = case.tally.by_kind.get(task.kind, 0) + 1
@@ -133,13 +136,12 @@ class Papers:
             told = f"{faults} faults about it and {declined} awards declined"
             case.breach("I6", f"{task.task_id} is at epoch {task.epoch} with {told}")
 
-    def _faults(self, plant_id: str, task_id: str) -> int:
-        """Those that met its plant, the station, any robot, or a message about it, its dock or where a robot is."""
+    def _faults(self, plant_id: str, task_id: str = "") -> int:
+        """Those that met a task's plant, the station, any robot, or a message about it, its dock or where a robot is."""
         gremlin = self._case.gremlin
         nodes = (plant_id, "station", *self._case.garden.names("robot"))
-        return sum(gremlin.touches[name] for name in nodes) + sum(
-            gremlin.crossed[about] for about in (task_id, plant_id, "station", "")
-        )
+        about = {task_id, plant_id, "station", ""}
+        return sum(gremlin.touches[name] for name in nodes) + sum(gremlin.crossed[name] for name in about)
 
     def _lasting(self, plant_id: str) -> bool:
         """Something is broken that may fail every robot that comes."""
