@@ -75,12 +75,27 @@ class Worker:
 
     id: str
     here: Point
+    """Where it stands, or is on its way to."""
     queue: TaskQueue = field(default_factory=TaskQueue)
     docked: str = ""
+    came: Point = (0.0, 0.0)
+    """Where it set out from."""
+    sets_out_s: float = 0.0
+    """When it is off its dock."""
     arrives_s: float = 0.0
+    """Docked, and at work."""
     ends_s: float = 0.0
     busy_s: float = 0.0
     served: list[int] = field(default_factory=list)
+
+    def at(self, now_s: float) -> Point:
+        """On its way, straight on."""
+        way_s = self.arrives_s - DOCKING_S - self.sets_out_s
+        share = min(1.0, max(0.0, (now_s - self.sets_out_s) / way_s)) if way_s > 0.0 else 1.0
+        return self.came[0] + share * (self.here[0] - self.came[0]), self.came[1] + share * (self.here[1] - self.came[1])
+
+    def drives(self, now_s: float) -> bool:
+        return self.sets_out_s <= now_s < self.arrives_s - DOCKING_S
 
 
 @dataclass(slots=True)
@@ -109,13 +124,18 @@ class Crowd:
         self._instance, self._rng, self._bid, self._together_s, self._rules = instance, rng, bid, together_s, rules
         self._plants = [self._market(n) for n in range(len(instance.plants))]
         self._docks = {f"plant-{number}": at for number, at in enumerate(instance.plants)}
-        self._workers = {f"robot-{n:03}": Worker(f"robot-{n:03}", at) for n, at in enumerate(instance.starts)}
+        self._workers = {f"robot-{n:03}": self._worker(f"robot-{n:03}", at) for n, at in enumerate(instance.starts)}
         self._heap: list[tuple[float, int, Callable[[], None]]] = []
         self._number = itertools.count()
         self.now_s = 0.0
         self._ticks = [math.inf] * len(self._plants)
         self._asked_s = [math.inf] * len(self._plants)
         self._out = Outcome([], [], 0.0, 0, 0, 0, [])
+
+    def _worker(self, robot_id: str, at: Point) -> Worker:
+        worker = Worker(robot_id, at)
+        worker.queue.may_wait = lambda entry: worker.drives(self.now_s)
+        return worker
 
     def _market(self, number: int) -> Market:
         x_m, y_m = self._instance.plants[number]
@@ -223,18 +243,29 @@ class Crowd:
             self._out.moves += 1
 
     def _begin(self, worker: Worker) -> None:
-        entry = worker.queue.next()
-        if entry is None or entry.running:
+        entry, running = worker.queue.next(), worker.queue.running
+        if entry is None or entry is running:
             return
+        if running is not None:
+            self._put_off(worker, running)
         entry.running, number = True, int(entry.plant_id.removeprefix("plant-"))
         spent_s = self._instance.leg_s(worker.here, bool(worker.docked), number)
+        worker.sets_out_s = self.now_s + (UNDOCKING_S if worker.docked else 0.0)
         worker.arrives_s, worker.ends_s = self.now_s + spent_s - work_s(KIND, 0.0), self.now_s + spent_s
         worker.busy_s += spent_s
-        worker.here, worker.docked = self._instance.plants[number], ""
+        worker.came, worker.here, worker.docked = worker.here, self._instance.plants[number], ""
         self._report(number, worker, entry, "running")
         self._later(spent_s, lambda: self._done(number, worker, entry))
 
+    def _put_off(self, worker: Worker, running: Entry) -> None:
+        """Something that lies nearer comes first."""
+        running.running = False
+        worker.here, worker.busy_s = worker.at(self.now_s), worker.busy_s - (worker.ends_s - self.now_s)
+        self._report(int(running.plant_id.removeprefix("plant-")), worker, running, "awarded")
+
     def _done(self, number: int, worker: Worker, entry: Entry) -> None:
+        if not entry.running or self.now_s < worker.ends_s:
+            return  # it was put off since
         worker.docked = entry.plant_id
         worker.served.append(number)
         worker.queue.drop(entry)
@@ -255,23 +286,24 @@ class Crowd:
 
     def condition(self, worker: Worker) -> Condition:
         """What the robot knows of itself now."""
-        running = next((entry for entry in worker.queue.entries if entry.running), None)
+        begun, running = worker.queue.begun, worker.queue.running
         at_work_s = max(0.0, self.now_s - worker.arrives_s)
-        there = running is not None and at_work_s > 0.0
+        there = begun is not None and at_work_s > 0.0
+        here = worker.here if running is None else worker.at(self.now_s)
 
         def travel(place: str, dock: str) -> float:
-            if place == "here" and running is not None and dock == running.plant_id:
+            if place == "here" and begun is not None and dock == begun.plant_id:
                 return max(0.0, worker.arrives_s - DOCKING_S - self.now_s)
-            return between_s(worker.here if place == "here" else self._docks[place], self._docks[dock])
+            return between_s(here if place == "here" else self._docks[place], self._docks[dock])
 
         return Condition(
             robot_id=worker.id,
             can=frozenset({KIND}),
             travel=travel,
-            docked_at=running.plant_id if there and running is not None else worker.docked,
-            current=None if running is None else self._stop(running),
-            at_work_s=at_work_s if running is not None else 0.0,
-            queue=tuple(self._stop(entry) for entry in worker.queue.entries if not entry.running),
+            docked_at=begun.plant_id if there and begun is not None else worker.docked,
+            current=None if begun is None else self._stop(begun),
+            at_work_s=at_work_s if begun is not None else 0.0,
+            queue=tuple(self._stop(entry) for entry in worker.queue.waiting),
         )
 
     def _stop(self, entry: Entry) -> Stop:

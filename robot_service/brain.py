@@ -197,8 +197,7 @@ class Brain:
 
     def condition(self) -> Condition:
         body, where = self.body.state, self.robot.where
-        head = self.queue.next()
-        running = head if head is not None and head.running else None
+        begun = self.queue.begun
         docks = self.settings.map.docks
         return Condition(
             robot_id=self.settings.id,
@@ -210,9 +209,9 @@ class Brain:
             battery_ratio=0.0 if body is None else body.battery_ratio,
             tank_ml=None if body is None else body.tank_ml,
             docked_at=where.docked_at,
-            current=None if running is None else self._stop(running),
-            at_work_s=0.0 if running is None else self._at_work_s(running),
-            queue=tuple(self._stop(entry) for entry in self.queue.entries if not entry.running),
+            current=None if begun is None else self._stop(begun),
+            at_work_s=0.0 if begun is None else self._at_work_s(begun),
+            queue=tuple(self._stop(entry) for entry in self.queue.waiting),
             taps=tuple(dock.name for dock in docks if dock.tap),
             chargers=tuple(dock.name for dock in docks),
         )

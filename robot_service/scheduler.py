@@ -50,15 +50,24 @@ class Scheduler:
     _sent: bool = False
     """An operator sent it where it stands: it stays until it is needed elsewhere, or in somebody's way."""
 
+    def __post_init__(self) -> None:
+        self.queue.may_wait = self._may_wait
+
     # ------------------------------------------------------------------ what others do to the queue
     def changed(self) -> None:
-        """Something was added: leave idleness, or a charge that is enough."""
+        """Something was added: leave idleness, a charge that is enough, or the way to what comes later now."""
         self._changed.set()
-        if self._idling and self._work is not None:
+        head, running = self.queue.next(), self.queue.running
+        if self._work is not None and (self._idling or (running is not None and running is not head)):
             self._work.cancel()
-        head = self.queue.next()
         if head is not None and head.running and head.kind == "charge" and len(self.queue.entries) > 1:
             head.killed = head.killed or "a task waits"
+
+    def _may_wait(self, entry: Entry) -> bool:
+        """The robot is only on its way there, and no deadline counts on that."""
+        asked = entry.announcement
+        free = asked is not None and asked.within_s is None and not entry.killed and not entry.committed
+        return free and self.robot.activity.job == "navigate"
 
     def kill(self, entry: Entry, why: str) -> None:
         """Take an entry away: at once before the permit, after the dose beyond it."""
@@ -122,6 +131,9 @@ class Scheduler:
         self.spread.later()
         self.robot.note("task", f"begins {entry.kind} {entry.plant_id}".strip(), task_id=entry.task_id)
         report, cut = await self._worked(self.planner.run(entry))
+        if cut and not entry.killed and self.queue.next() is not entry:
+            self._put_off(entry)
+            return
         self.queue.drop(entry)
         self._rest()
         if report is None:
@@ -136,6 +148,13 @@ class Scheduler:
         self._sent = entry.job is not None and entry.job.kind in ("goto", "undock") and report.state == "done"
         if cut and self.robot.where.docked_at and not self._stopped():
             await self._worked(self._leave())
+
+    def _put_off(self, entry: Entry) -> None:
+        """Something that lies nearer comes first."""
+        entry.running, head = False, self.queue.next()
+        self._rest()
+        before = head.plant_id or head.kind if head is not None else ""
+        self.robot.note("task", f"puts {entry.kind} {entry.plant_id} off: {before} comes first", task_id=entry.task_id)
 
     async def _worked(self, work: Coroutine[Any, Any, Any]) -> tuple[Any, bool]:
         """Run it as a task of its own that `kill` can cancel. Returns (result, cut short)."""

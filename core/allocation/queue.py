@@ -6,7 +6,7 @@ Pure. An award is known by (task_id, epoch): the same again changes nothing, an 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -51,6 +51,8 @@ class TaskQueue:
     """What the robot has promised. `entries[0]` is next, or running."""
 
     entries: list[Entry] = field(default_factory=list)
+    may_wait: Callable[[Entry], bool] = lambda entry: False
+    """Asked of what is running: whether something else may still come first."""
     _epochs: OrderedDict[str, int] = field(default_factory=OrderedDict)
 
     def award(self, award: Award, now_s: float, at: int | None = None) -> Entry:
@@ -87,7 +89,7 @@ class TaskQueue:
             lease_until_s=now_s + award.lease_s,
             since_s=now_s,
         )
-        self.entries.insert(len(self.entries) if at is None else self._begun() + at, entry)
+        self.entries.insert(len(self.entries) if at is None else len(self.entries) - len(self.waiting) + at, entry)
         return entry
 
     def _remember(self, task_id: str, epoch: int) -> None:
@@ -100,18 +102,30 @@ class TaskQueue:
         """An operator's job at the end, an errand of our own in front of everything that has not begun."""
         if len(self.entries) >= QUEUE_MAX:
             raise Refused(f"the queue is full with {QUEUE_MAX} tasks")
-        self.entries.insert(self._begun() if first else len(self.entries), entry)
+        running = self.running is not None
+        self.entries.insert(int(running) if first else len(self.entries), entry)
 
     def arrange(self, order: Sequence[int]) -> None:
         """Put what has not begun in this order of its numbers."""
-        begun = self._begun()
-        waiting = self.entries[begun:]
+        waiting = self.waiting
         assert sorted(order) == list(range(len(waiting))), "every one of them, once"
-        self.entries[begun:] = [waiting[number] for number in order]
+        self.entries[len(self.entries) - len(waiting) :] = [waiting[number] for number in order]
 
-    def _begun(self) -> int:
-        """How many entries are running: the first, or none."""
-        return 1 if self.entries and self.entries[0].running else 0
+    @property
+    def running(self) -> Entry | None:
+        return next((entry for entry in self.entries if entry.running), None)
+
+    @property
+    def begun(self) -> Entry | None:
+        """What is running and cannot be put off any more."""
+        running = self.running
+        return None if running is None or self.may_wait(running) else running
+
+    @property
+    def waiting(self) -> list[Entry]:
+        """What has not begun, in the order in which it will be done."""
+        begun = self.begun
+        return [entry for entry in self.entries if entry is not begun]
 
     def find(self, task_id: str) -> Entry | None:
         return next((entry for entry in self.entries if entry.task_id == task_id), None)

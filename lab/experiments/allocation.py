@@ -58,9 +58,8 @@ def allocation(trials: int | None, seed: int, swap: Price | None, progress: Call
 def compared(instance: Instance, seed: int, bid: Price) -> tuple[float, float]:
     """Our total and our end over the best that OR-tools finds."""
     outcome = Crowd(instance, Random(f"{seed}/words"), bid).run()
-    routes = [instance.route_s(robot, plants) for robot, plants in enumerate(outcome.routes)]
     least_s, soonest_s = best_found(instance, outcome.routes)
-    return sum(routes) / least_s, outcome.makespan_s / soonest_s
+    return sum(outcome.busy_s) / least_s, outcome.makespan_s / soonest_s
 
 
 def best_found(instance: Instance, ours: list[list[int]]) -> tuple[float, float]:

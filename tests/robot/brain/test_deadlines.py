@@ -96,7 +96,7 @@ def test_a_robot_reckons_with_the_time_that_is_left_of_what_it_promised():
     async def story(garden):
         brain = garden.brains["robot-1"]
         await garden.award("plant-3")
-        await garden.until(lambda: brain.queue.entries[0].running, 5.0)
+        await garden.until(lambda: brain.robot.activity.job == "act", 60.0)
         award = garden.award_of("plant-1", number=2)
         asked_for = award.announcement.model_copy(update={"within_s": 200.0})
         award = award.model_copy(update={"announcement": asked_for})

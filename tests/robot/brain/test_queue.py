@@ -61,6 +61,21 @@ def test_errands_of_our_own_go_in_front_of_what_has_not_begun():
     assert [e.task_id for e in queue.entries] == ["plant-1:1", "own", "plant-1:2"]
 
 
+def test_what_is_only_on_its_way_may_still_be_put_behind_another():
+    queue = TaskQueue(may_wait=lambda entry: not entry.progress)
+    first = queue.award(award(1), 0.0)
+    first.running = True
+    assert queue.begun is None
+    queue.award(award(2), 1.0, at=0)
+    assert [entry.task_id for entry in queue.waiting] == ["plant-1:2", "plant-1:1"]
+    assert queue.running is first
+    queue.arrange([1, 0])
+    first.progress = 0.5
+    assert queue.begun is first
+    queue.award(award(3), 2.0, at=0)
+    assert [entry.task_id for entry in queue.entries] == ["plant-1:1", "plant-1:3", "plant-1:2"]
+
+
 def test_the_queue_is_bounded():
     queue = TaskQueue()
     for number in range(QUEUE_MAX):

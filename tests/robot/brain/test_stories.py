@@ -63,6 +63,41 @@ def test_two_awards_are_done_one_after_the_other_and_both_leases_are_kept():
     in_garden(story)
 
 
+def test_a_robot_on_its_way_serves_a_nearer_plant_first_and_then_goes_on():
+    async def story(garden):
+        await garden.award("plant-3")
+        brain, far, near = garden.brains["robot-1"], garden.plants["plant-3"], garden.plants["plant-1"]
+        await garden.until(lambda: brain.robot.activity.v_mps > 0.2, 20.0)
+        await garden.award("plant-1")
+        assert [entry.plant_id for entry in brain.queue.entries] == ["plant-1", "plant-3"]
+        await garden.until(lambda: far.reports[-1].state == "awarded", 2.0)
+        await garden.until(lambda: far.ended, 200.0)
+        assert near.ended.state == far.ended.state == "done"
+        told = [event.what for event in brain.events.since(0)]
+        assert "puts water plant-3 off: plant-1 comes first" in told
+        assert told.index("water done") < told.index("begins water plant-3", told.index("begins water plant-3") + 1)
+
+    in_garden(story)
+
+
+@pytest.mark.parametrize("what", ["deadline", "docking"])
+def test_a_task_that_cannot_wait_is_not_put_off(what):
+    async def story(garden):
+        brain, award = garden.brains["robot-1"], garden.award_of("plant-3")
+        if what == "deadline":
+            in_time = award.announcement.model_copy(update={"within_s": 300.0})
+            award = award.model_copy(update={"announcement": in_time})
+        await garden.call("robot-1", "POST", "/tasks", award, as_="plant-3")
+        job = "navigate" if what == "deadline" else "dock"
+        await garden.until(lambda: brain.robot.activity.job == job, 60.0)
+        await garden.award("plant-1")
+        assert [entry.plant_id for entry in brain.queue.entries] == ["plant-3", "plant-1"]
+        await garden.until(lambda: garden.plants["plant-1"].ended, 200.0)
+        assert not [event.what for event in brain.events.since(0) if " off: " in event.what]
+
+    in_garden(story)
+
+
 def test_a_kill_ends_the_epoch_it_names_and_no_later_one():
     async def story(garden):
         await garden.award("plant-3", epoch=1)
