@@ -131,7 +131,7 @@ class Scheduler:
         self.spread.later()
         self.robot.note("task", f"begins {entry.kind} {entry.plant_id}".strip(), task_id=entry.task_id)
         report, cut = await self._worked(self.planner.run(entry))
-        if cut and not entry.killed and self.queue.next() is not entry:
+        if cut and not entry.killed:
             self._put_off(entry)
             return
         self.queue.drop(entry)

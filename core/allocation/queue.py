@@ -89,7 +89,9 @@ class TaskQueue:
             lease_until_s=now_s + award.lease_s,
             since_s=now_s,
         )
-        self.entries.insert(len(self.entries) if at is None else len(self.entries) - len(self.waiting) + at, entry)
+        waiting = self.waiting
+        waiting.insert(len(waiting) if at is None else at, entry)
+        self._line_up(waiting)
         return entry
 
     def _remember(self, task_id: str, epoch: int) -> None:
@@ -109,7 +111,12 @@ class TaskQueue:
         """Put what has not begun in this order of its numbers."""
         waiting = self.waiting
         assert sorted(order) == list(range(len(waiting))), "every one of them, once"
-        self.entries[len(self.entries) - len(waiting) :] = [waiting[number] for number in order]
+        self._line_up([waiting[number] for number in order])
+
+    def _line_up(self, waiting: Sequence[Entry]) -> None:
+        """Behind what has begun, wherever that stood: it may just have arrived."""
+        begun = self.begun
+        self.entries[:] = waiting if begun is None else [begun, *waiting]
 
     @property
     def running(self) -> Entry | None:

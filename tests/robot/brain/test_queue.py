@@ -76,6 +76,16 @@ def test_what_is_only_on_its_way_may_still_be_put_behind_another():
     assert [entry.task_id for entry in queue.entries] == ["plant-1:1", "plant-1:3", "plant-1:2"]
 
 
+def test_what_arrived_while_it_was_put_behind_another_is_first_again_and_nothing_is_lost():
+    queue = TaskQueue(may_wait=lambda entry: not entry.progress)
+    first = queue.award(award(1), 0.0)
+    first.running = True
+    queue.award(award(2), 1.0, at=0)
+    first.progress = 0.5
+    queue.award(award(3), 2.0, at=1)
+    assert [entry.task_id for entry in queue.entries] == ["plant-1:1", "plant-1:2", "plant-1:3"]
+
+
 def test_the_queue_is_bounded():
     queue = TaskQueue()
     for number in range(QUEUE_MAX):
