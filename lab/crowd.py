@@ -248,7 +248,7 @@ class Crowd:
             return
         if running is not None:
             self._put_off(worker, running)
-        entry.running, number = True, int(entry.plant_id.removeprefix("plant-"))
+        entry.running, number = True, _number(entry)
         spent_s = self._instance.leg_s(worker.here, bool(worker.docked), number)
         worker.sets_out_s = self.now_s + (UNDOCKING_S if worker.docked else 0.0)
         worker.arrives_s, worker.ends_s = self.now_s + spent_s - work_s(KIND, 0.0), self.now_s + spent_s
@@ -261,7 +261,7 @@ class Crowd:
         """Something that lies nearer comes first."""
         running.running = False
         worker.here, worker.busy_s = worker.at(self.now_s), worker.busy_s - (worker.ends_s - self.now_s)
-        self._report(int(running.plant_id.removeprefix("plant-")), worker, running, "awarded")
+        self._report(_number(running), worker, running, "awarded")
 
     def _done(self, number: int, worker: Worker, entry: Entry) -> None:
         if not entry.running or self.now_s < worker.ends_s:
@@ -288,7 +288,6 @@ class Crowd:
         """What the robot knows of itself now."""
         begun, running = worker.queue.begun, worker.queue.running
         at_work_s = max(0.0, self.now_s - worker.arrives_s)
-        there = begun is not None and at_work_s > 0.0
         here = worker.here if running is None else worker.at(self.now_s)
 
         def travel(place: str, dock: str) -> float:
@@ -300,7 +299,7 @@ class Crowd:
             robot_id=worker.id,
             can=frozenset({KIND}),
             travel=travel,
-            docked_at=begun.plant_id if there and begun is not None else worker.docked,
+            docked_at=begun.plant_id if begun is not None and at_work_s > 0.0 else worker.docked,
             current=None if begun is None else self._stop(begun),
             at_work_s=at_work_s if begun is not None else 0.0,
             queue=tuple(self._stop(entry) for entry in worker.queue.waiting),
@@ -309,3 +308,8 @@ class Crowd:
     def _stop(self, entry: Entry) -> Stop:
         settled = self.now_s - entry.since_s > OVERTAKEN_FOR_S
         return Stop(dock=entry.plant_id, work_s=work_s(KIND, 0.0), task_id=entry.task_id, settled=settled)
+
+
+def _number(entry: Entry) -> int:
+    """Of its plant."""
+    return int(entry.plant_id.removeprefix("plant-"))

@@ -232,8 +232,8 @@ class Brain:
         now_s = self.clock.now()
         return [
             asked.model_copy(update={"within_s": max(0.0, entry.since_s + asked.within_s - now_s)})
-            for entry in self.queue.entries
-            if not entry.running and (asked := entry.announcement) is not None and asked.within_s is not None
+            for entry in self.queue.waiting
+            if (asked := entry.announcement) is not None and asked.within_s is not None
         ]
 
     def _at_work_s(self, running: Entry) -> float:

@@ -137,10 +137,10 @@ class Scheduler:
         self.queue.drop(entry)
         self._rest()
         if report is None:
-            report = _gave_up(self.robot.settings.id, entry, entry.killed or "interrupted")
+            report = _gave_up(self.robot.settings.id, entry, entry.killed)
         outcome = f"{entry.kind} {report.state}" + (f": {report.reason}" if report.reason else "")
         self.robot.note("task", outcome, task_id=entry.task_id, delivered_ml=report.delivered_ml)
-        if entry.announcement is not None and not (cut and entry.killed):
+        if entry.announcement is not None and not cut:
             self.reporter.finish(entry, report)
         if entry.announcement is None and report.state == "failed":
             self._own_after_s = self.robot.clock.now() + OWN_RETRY_S

@@ -104,8 +104,8 @@ class TaskQueue:
         """An operator's job at the end, an errand of our own in front of everything that has not begun."""
         if len(self.entries) >= QUEUE_MAX:
             raise Refused(f"the queue is full with {QUEUE_MAX} tasks")
-        running = self.running is not None
-        self.entries.insert(int(running) if first else len(self.entries), entry)
+        begun = bool(self.entries) and self.entries[0].running
+        self.entries.insert(int(begun) if first else len(self.entries), entry)
 
     def arrange(self, order: Sequence[int]) -> None:
         """Put what has not begun in this order of its numbers."""

@@ -102,13 +102,12 @@ class Hawker:
 
     def condition(self) -> Condition:
         """What it knows of itself now."""
-        entries, now_s = self.queue.entries, self.clock.now()
-        running = next((entry for entry in entries if entry.running), None)
+        running, now_s = self.queue.running, self.clock.now()
         return Condition(
             robot_id=self.id, can=frozenset({KIND}), travel=self.travel_s,
             docked_at=self.docked, current=None if running is None else self._stop(running),
             at_work_s=0.0 if running is None else max(0.0, now_s - self.arrives_s),
-            queue=tuple(self._stop(entry) for entry in entries if not entry.running),
+            queue=tuple(self._stop(entry) for entry in self.queue.waiting),
         )  # fmt: skip
 
     def travel_s(self, place: str, dock: str) -> float:

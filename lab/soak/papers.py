@@ -148,8 +148,8 @@ class Papers:
         case = self._case
         robots = case.garden.names("robot")
         broken = any(case.truth.robots[name].pump_broken or case.away(name) for name in robots)
-        broken = broken or case.truth.pots[plant_id].probe_silent
-        return broken or case.truth.water_out or bool(case.stopped) or case.away(plant_id) or case.away("station")
+        broken = broken or case.truth.pots[plant_id].probe_silent or case.truth.water_out
+        return broken or bool(case.stopped) or case.away(plant_id) or case.away("station")
 
     def _fruits(self, plant_id: str, pot: Pot, inventory: Inventory) -> None:
         if inventory.generation < self._generation[plant_id]:

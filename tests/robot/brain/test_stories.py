@@ -171,7 +171,10 @@ def test_a_plant_that_fell_silent_loses_the_robot_when_the_lease_ends():
         await garden.award("plant-3")
         await garden.until(lambda: garden.plants["plant-3"].reports, 5.0)
         garden.plants["plant-3"].silent = True
-        await garden.until(lambda: not garden.brains["robot-1"].queue.entries, 14.0)
+        brain = garden.brains["robot-1"]
+        await garden.until(lambda: not brain.queue.entries, 14.0)
+        assert poured(garden, "plant-3") == 0.0
+        assert any("the lease ran out" in event.what for event in brain.events.since(0))
 
     in_garden(story)
 
