@@ -27,11 +27,14 @@ class FruitTexts:
         return b'{"inventory":' + self.inventory(document.inventory) + b"," + rest[1:]
 
     def _encode(self, inventory: Inventory) -> bytes:
-        known, seen = self._known, {}
-        for fruit in inventory.fruits:
-            before = known.get(id(fruit))
-            # The entry holds the fruit, so that no other can have its number while we know it.
-            seen[id(fruit)] = before or (fruit, fruit.model_dump_json(exclude_none=True).encode())
-        self._known = seen
+        known, fruits = self._known, inventory.fruits
+        if len(known) > 2 * len(fruits):
+            known = self._known = {id(fruit): known[id(fruit)] for fruit in fruits if id(fruit) in known}
+        # An entry holds its fruit, so that no other can have the fruit's number while we know it.
+        texts = [(known.get(id(fruit)) or self._learn(fruit))[1] for fruit in fruits]
         head = inventory.model_dump_json(exclude={"fruits"}, exclude_none=True).encode()
-        return head[:-1] + b',"fruits":[' + b",".join([text for _, text in seen.values()]) + b"]}"
+        return head[:-1] + b',"fruits":[' + b",".join(texts) + b"]}"
+
+    def _learn(self, fruit: Fruit) -> tuple[Fruit, bytes]:
+        entry = self._known[id(fruit)] = fruit, fruit.model_dump_json(exclude_none=True).encode()
+        return entry

@@ -16,6 +16,7 @@ from starlette.responses import Response
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from core.errors import ConfigError
+from core.mesh.chassis import front
 
 REQUEST_WITHIN_S = 5.0
 """A request, body included, must have come in within this many seconds of its first byte."""
@@ -212,7 +213,7 @@ class Server(uvicorn.Server):
 
 def make_server(app: FastAPI) -> Server:
     config = uvicorn.Config(
-        app,
+        front(app),
         http=ImpatientProtocol,
         ws="none",
         lifespan="off",

@@ -69,14 +69,14 @@ def _check_json(raw: bytes) -> None:
     if not raw:
         raise BadRequest("the body is empty", hint="send a JSON object")
     try:
-        value = json.loads(raw.decode("utf-8"), object_pairs_hook=_once, parse_constant=_no_constant, parse_float=_finite)
+        value = _DECODER.decode(raw.decode("utf-8"))
     except RecursionError:
         raise BadRequest("the body is nested too deeply") from None
     except UnicodeDecodeError:
         raise BadRequest("the body is not UTF-8") from None
     except ValueError as error:
         raise BadRequest(f"the body is not JSON: {error}"[:300]) from None
-    if _deeper(value, DEPTH_MAX):
+    if raw.count(b"{") + raw.count(b"[") > DEPTH_MAX and _deeper(value, DEPTH_MAX):
         raise BadRequest(f"the body is nested more than {DEPTH_MAX} deep")
 
 
@@ -98,6 +98,9 @@ def _finite(text: str) -> float:
     if value in (float("inf"), float("-inf")):
         raise ValueError(f"{text[:40]} is too large")
     return value
+
+
+_DECODER = json.JSONDecoder(object_pairs_hook=_once, parse_constant=_no_constant, parse_float=_finite)
 
 
 def _deeper(value: Any, depth: int) -> bool:
