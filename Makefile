@@ -1,5 +1,5 @@
 # The verbs that people and CI use. `make up` on a fresh machine needs Python, git, make and a C compiler.
-.PHONY: install up test test-compose check bench reproduce soak docs
+.PHONY: install up test test-compose check bench reproduce soak mutants docs
 .DEFAULT_GOAL := install
 
 PYTHON ?= python3
@@ -44,6 +44,9 @@ reproduce: $(STAMP)
 
 soak: $(STAMP)
 	$(BIN)/python -m pytest -m soak $(ARGS)
+
+mutants: $(STAMP)
+	$(BIN)/python -m lab.mutants $(ARGS)
 
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet

@@ -1,0 +1,1 @@
+"""Mutation testing: are small mistakes, put into the code one at a time, noticed by its tests?"""
