@@ -312,7 +312,5 @@ def _fsync(sync: Callable[[], None]) -> None:
 
 def _unless_absent(call: Callable[[], None]) -> None:
     """Only ENOENT means absent."""
-    try:
+    with contextlib.suppress(FileNotFoundError):
         call()
-    except FileNotFoundError:
-        return

@@ -2,19 +2,24 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import hashlib
 import json
+import math
+import os
 import random
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 
 from core.clock import VirtualClock
 from core.errors import StorageError
-from core.store import DurableDocument, pack
+from core.store import Disk, DurableDocument, pack
 from core.virtual import run_virtual
 
 Disks = dict[str, Any]
+T = TypeVar("T")
 
 
 def open_file(folder: Path, disk: Any = None) -> DurableDocument:
@@ -45,6 +50,76 @@ def test_the_file_is_readable_json_with_its_generation(tmp_path: Path) -> None:
     envelope = json.loads(file.path.read_bytes())
     assert (envelope["schema"], envelope["generation"], envelope["doc"]) == ("test/1", 1, {"a": 1})
     file.close()
+
+
+def test_a_file_is_the_same_bytes_for_the_same_document(tmp_path: Path) -> None:
+    file = open_file(tmp_path)
+    file.load()
+    file.commit({"a": [1, 2.5], "b": "x"})
+    doc = b'{"a":[1,2.5],"b":"x"}'
+    digest = hashlib.sha256(b"test/1\n1\n" + doc).hexdigest().encode()
+    assert file.path.read_bytes() == b'{"schema":"test/1","generation":1,"sha256":"' + digest + b'","doc":' + doc + b"}\n"
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        file.commit({"a": math.nan})
+    file.close()
+
+
+def test_a_commit_is_these_system_calls_in_this_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = open_file(tmp_path)
+    file.load()
+    file.commit({"n": 1})
+    file.commit({"n": 2})
+    calls: list[tuple[Any, ...]] = []
+    names: dict[int, str] = {}
+
+    def watch(name: str) -> None:
+        real = getattr(os, name)
+
+        def call(*args: Any) -> Any:
+            answer = real(*args)
+            if name == "open":
+                names[answer] = Path(args[0]).name
+            calls.append(
+                (name, *(names.get(a, a) if isinstance(a, int) else a.name if isinstance(a, Path) else a for a in args))
+            )
+            return answer
+
+        monkeypatch.setattr(os, name, call)
+
+    for name in ("open", "write", "fsync", "close", "link", "unlink", "rename"):
+        watch(name)
+    file.commit({"n": 3})
+    monkeypatch.undo()
+    folder = tmp_path.name
+    assert calls == [
+        ("open", "doc.json.tmp", os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600),
+        ("write", "doc.json.tmp", pack("test/1", 3, b'{"n":3}')),
+        ("fsync", "doc.json.tmp"),
+        ("close", "doc.json.tmp"),
+        ("unlink", "doc.json.1"),
+        ("link", "doc.json", "doc.json.1"),
+        ("rename", "doc.json.tmp", "doc.json"),
+        ("open", folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC),
+        ("fsync", folder),
+        ("close", folder),
+    ]
+    file.close()
+
+
+def test_beside_a_document_lie_its_older_copy_and_its_lock(tmp_path: Path) -> None:
+    file = DurableDocument(tmp_path / "not" / "yet" / "doc.json", "test/1", VirtualClock())
+    file.load()
+    file.commit({"n": 1})
+    file.commit({"n": 2})
+    file.close()
+    assert {path.name for path in file.path.parent.iterdir()} == {"doc.json", "doc.json.1", "doc.json.lock"}
+
+
+def test_a_place_that_cannot_hold_files_is_named(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    file = DurableDocument(tmp_path / "taken" / "doc.json", "test/1", VirtualClock())
+    with pytest.raises(StorageError, match=r"cannot use .*taken"):
+        file.load()
 
 
 def test_two_writers_are_refused(tmp_path: Path) -> None:
@@ -81,22 +156,25 @@ def test_concurrent_saves_share_commits_and_each_is_durable_when_answered(tmp_pa
     file.close()
 
 
-def written_by(folder: Path, writers: int, each: int, gather_s: float) -> tuple[int, float]:
-    """Commits and virtual seconds that writers need who write again half a millisecond after their answer."""
+def written_by(folder: Path, writers: int, each: int, gather_s: float, uneven_s: float = 0.0) -> tuple[int, float]:
+    """Commits and virtual seconds that writers need who write again half a millisecond after their answer.
+
+    Each further one thinks `uneven_s` longer.
+    """
 
     async def main() -> tuple[int, float]:
         clock = VirtualClock()
         file = DurableDocument(folder / "doc.json", "test/1", clock, None, gather_s)
         file.load()
 
-        async def write(first_s: float) -> None:
-            await clock.sleep(first_s)
+        async def write(writer: int) -> None:
+            await clock.sleep(0.0002 * writer)
             for n in range(each):
                 await file.save({"n": n})
-                await clock.sleep(0.0005)
+                await clock.sleep(0.0005 + uneven_s * writer)
 
         began_s = clock.now()
-        await asyncio.gather(*(write(0.0002 * n) for n in range(writers)))
+        await asyncio.gather(*(write(writer) for writer in range(writers)))
         file.close()
         return file.generation, clock.now() - began_s
 
@@ -108,6 +186,25 @@ def test_writers_who_shared_a_commit_share_the_next_one(tmp_path: Path) -> None:
     assert together[0] <= 20 + 2
     assert together[0] < 0.6 * alone[0]
     assert together[1] < alone[1]
+
+
+def test_nobody_waits_longer_than_for_the_last_who_shared_the_commit_before(tmp_path: Path) -> None:
+    commits, took_s = written_by(tmp_path, 4, 20, 0.5, uneven_s=0.001)
+    assert commits <= 20 + 2
+    assert took_s < 0.2 + 0.5  # the last one finds nobody to share with, once
+
+
+def test_who_shared_a_commit_is_not_waited_for_unless_that_was_asked_for(tmp_path: Path) -> None:
+    async def main() -> None:
+        file = open_file(tmp_path)
+        file.load()
+        await asyncio.gather(file.save({"n": 1}), file.save({"n": 2}))
+        began_s = asyncio.get_running_loop().time()
+        await file.save({"n": 3})
+        assert asyncio.get_running_loop().time() - began_s == pytest.approx(0.001)
+        file.close()
+
+    run_virtual(main())
 
 
 def test_a_lone_writer_never_waits_for_others(tmp_path: Path) -> None:
@@ -241,6 +338,106 @@ def test_saves_queued_behind_a_failed_commit_fail_with_it(tmp_path: Path, disks:
         file.close()
 
     run_virtual(main())
+
+
+class LateClock(VirtualClock):
+    """Offloaded work has its effect when its time is over, so that others may ask meanwhile."""
+
+    async def offload(self, fn: Callable[[], T], cost_s: float = 0.0) -> T:
+        await asyncio.sleep(cost_s)
+        return fn()
+
+
+def test_what_was_queued_while_a_commit_failed_fails_too_and_one_failure_is_counted(tmp_path: Path, disks: Disks) -> None:
+    async def main() -> None:
+        file = DurableDocument(tmp_path / "doc.json", "test/1", LateClock(), disks["failing"]("rename", errno.ENOSPC))
+        file.load()
+        assert file.failures == 0
+        first = asyncio.create_task(file.save({"n": 1}))
+        await asyncio.sleep(0.0005)
+        second = asyncio.create_task(file.save({"n": 2}))
+        answers = await asyncio.gather(first, second, return_exceptions=True)
+        assert all(isinstance(answer, StorageError) for answer in answers)
+        assert (file.failures, file.generation) == (1, 0)
+        assert await file.save({"n": 3}) == 1
+        file.close()
+
+    run_virtual(main())
+
+
+def test_a_broken_file_counts_and_refuses_every_save_and_every_commit(tmp_path: Path, disks: Disks) -> None:
+    async def main() -> None:
+        file = open_file(tmp_path, disks["failing"]("fsync", errno.EIO))
+        file.load()
+        for failures in (1, 2, 3):
+            with pytest.raises(StorageError, match="fsync failed" if failures == 1 else "not durable any more"):
+                await file.save({"n": failures})
+            assert file.failures == failures
+        with pytest.raises(StorageError, match="not durable any more"):
+            file.commit({"n": 4})
+        file.close()
+
+    run_virtual(main())
+
+
+def test_who_stops_waiting_for_a_save_does_not_hold_up_the_others(tmp_path: Path) -> None:
+    async def main() -> None:
+        file = open_file(tmp_path)
+        file.load()
+        saves = [asyncio.create_task(file.save({"n": n})) for n in range(3)]
+        await asyncio.sleep(0.0)
+        saves[0].cancel()
+        assert await asyncio.gather(*saves[1:]) == [1, 1]
+        assert await file.save({"n": 3}) == 2
+        file.close()
+
+    run_virtual(main())
+
+
+def test_a_disk_that_takes_no_bytes_is_an_error(tmp_path: Path) -> None:
+    class Full(Disk):
+        def write(self, fd: int, data: bytes) -> int:
+            return 0
+
+    file = open_file(tmp_path, Full())
+    file.load()
+    with pytest.raises(StorageError, match="took no bytes"):
+        file.commit({"n": 1})
+    file.close()
+
+
+def test_the_newer_of_two_sound_copies_counts_and_becomes_the_current_one(tmp_path: Path) -> None:
+    (tmp_path / "doc.json").write_bytes(pack("test/1", 4, b'{"n":4}'))
+    (tmp_path / "doc.json.1").write_bytes(pack("test/1", 5, b'{"n":5}'))
+    file = open_file(tmp_path)
+    assert file.load() == {"n": 5}
+    assert (file.generation, file.alarms) == (5, [])
+    assert file.path.read_bytes() == pack("test/1", 5, b'{"n":5}')
+    file.close()
+
+
+@pytest.mark.parametrize(("method", "said"), [("link", "cannot reinstate"), ("rename", "cannot move the damaged")])
+def test_a_disk_that_fails_while_copies_are_put_in_order_is_said(
+    tmp_path: Path, disks: Disks, method: str, said: str
+) -> None:
+    (tmp_path / "doc.json").write_bytes(b"{}")
+    (tmp_path / "doc.json.1").write_bytes(pack("test/1", 1, b'{"n":1}'))
+    file = open_file(tmp_path, disks["failing"](method, errno.EIO))
+    with pytest.raises(StorageError, match=said):
+        file.load()
+    assert reopen(file) == {"n": 1}
+
+
+def test_damaged_files_are_all_kept_and_numbered(tmp_path: Path) -> None:
+    for number in (1, 2, 3):
+        (tmp_path / "doc.json").unlink(missing_ok=True)  # it may be one file with its older copy
+        (tmp_path / "doc.json").write_bytes(f"damage {number}".encode())
+        (tmp_path / "doc.json.1").write_bytes(pack("test/1", 1, b'{"n":1}'))
+        file = open_file(tmp_path)
+        assert file.load() == {"n": 1}
+        assert file.alarms == [f"doc.json was damaged (not a whole envelope); kept as doc.json.bad-{number}"]
+        assert (tmp_path / f"doc.json.bad-{number}").read_bytes() == f"damage {number}".encode()
+        file.close()
 
 
 @pytest.mark.parametrize("code", [errno.EMFILE, errno.EACCES, errno.EIO])

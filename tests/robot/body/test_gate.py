@@ -5,16 +5,29 @@ from __future__ import annotations
 import ast
 import math
 import random
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 from msgspec import structs
 
-from core.manipulation.arm import Joints
+from core.manipulation.arm import Joints, reach_m
 from core.robots import gardener
 from core.wire.body import Setpoint
-from robot_service.body.gate import LIFE_S, SLOW_MPS, STOP, Command, Dose, GateState, check
+from robot_service.body import gate
+from robot_service.body.gate import (
+    ARM_OUT_M,
+    BASE_FRESH_S,
+    LIFE_S,
+    SERVO_FRESH_S,
+    SLOW_MPS,
+    STOP,
+    Command,
+    Dose,
+    GateState,
+    Verdict,
+    check,
+)
 
 ROOT = Path(__file__).parents[3]
 NOW_S = 100.0
@@ -189,6 +202,214 @@ def test_driving_and_pumping_at_once_drives_only() -> None:
 def test_a_dose_is_debited_before_the_pump_starts() -> None:
     verdict = check(PUMP, DOCKED, NOW_S)
     assert (verdict.command.pump, verdict.debit_ml) == (False, 50.0)
+
+
+# Where each limit lies
+
+
+def at(now_s: float, age_s: float, state: GateState = GOOD) -> GateState:
+    """All heard of `age_s` before `now_s`."""
+    return replace(state, heard_s=now_s - age_s, base_s=now_s - age_s, servo_s=now_s - age_s)
+
+
+def passes(setpoint: Setpoint, state: GateState, now_s: float = NOW_S) -> bool:
+    """Whether all of it gets through."""
+    verdict = check(setpoint, state, now_s)
+    assert bool(verdict.refusal) == bool(verdict.refusals)
+    return verdict.command != STOP and not verdict.refusals
+
+
+def test_the_defaults_of_everything_are_off() -> None:
+    off = {"base": "stop", "v_mps": 0.0, "omega_radps": 0.0, "arm": None, "arm_s": 0.0, "gripper_m": None, "roll_rad": None}
+    assert asdict(Command()) == off | {"pump": False}
+    assert (Verdict().command, Verdict().refusals, Verdict().debit_ml, Verdict().refusal) == (STOP, (), 0.0, "")
+    assert asdict(Dose()) == {"used": False, "debited_ml": 0.0, "delivered_ml": 0.0, "refusal": ""}
+    state = GateState()
+    assert (state.stopped, state.stopped_by, state.base_up, state.servo_up, state.docked) == (True, "", False, False, False)
+    assert (state.heard_s, state.base_s, state.servo_s) == (-math.inf, -math.inf, -math.inf)
+    assert (state.v_mps, state.omega_radps, state.dt_s) == (0.0, 0.0, 0.02)
+
+
+@pytest.mark.parametrize("field", ["heard_s", "stopped", "base_up", "base_s", "servo_up", "servo_s"])
+def test_what_was_never_heard_of_stops_everything_by_itself(field: str) -> None:
+    silent = replace(GOOD, **{field: getattr(GateState(), field)})
+    assert passes(DRIVE, GOOD)
+    assert check(DRIVE, silent, NOW_S).command == STOP
+
+
+def test_without_a_setpoint_nothing_moves_and_nothing_is_refused() -> None:
+    assert check(None, GOOD, NOW_S) == Verdict()
+    assert check(DRIVE, replace(GOOD, heard_s=-math.inf), NOW_S) == Verdict()
+
+
+@pytest.mark.parametrize(
+    ("field", "life_s"),
+    [("heard_s", LIFE_S), ("base_s", BASE_FRESH_S), ("servo_s", SERVO_FRESH_S)],
+    ids=lambda value: str(value),
+)
+def test_news_counts_from_the_moment_it_came_to_the_end_of_its_life(field: str, life_s: float) -> None:
+    for age_s, heard in ((0.0, True), (life_s, True), (life_s + 1e-6, False), (-1e-6, False)):
+        assert passes(DRIVE, replace(at(0.0, 0.0), **{field: -age_s}), 0.0) == heard, age_s
+
+
+def test_the_limits_are_those_of_the_safety_rules() -> None:
+    assert pytest.approx(0.24) == LIFE_S
+    assert (BASE_FRESH_S, SERVO_FRESH_S) == (0.5, 2.0)
+    assert (SLOW_MPS, pytest.approx(0.224)) == (0.1, ARM_OUT_M)
+
+
+@pytest.mark.parametrize(("by", "said"), [("anna", "stopped by anna"), ("", "stopped")])
+def test_who_stopped_it_is_said_when_it_is_known(by: str, said: str) -> None:
+    assert refused(DRIVE, replace(GOOD, stopped=True, stopped_by=by)) == said
+
+
+@pytest.mark.parametrize(
+    "setpoint",
+    [DRIVE, SEEK, PUMP, Setpoint(seq=1, arm=OUT), Setpoint(seq=1, gripper_m=0.01), Setpoint(seq=1, roll_rad=0.1)],
+)
+def test_each_wish_by_itself_is_refused_aloud_and_the_wish_for_nothing_in_silence(setpoint: Setpoint) -> None:
+    stopped = replace(IN_HAND, stopped=True)
+    assert check(setpoint, stopped, NOW_S).refusals == ("stopped",)
+    assert check(Setpoint(seq=1), stopped, NOW_S) == Verdict()
+
+
+def test_every_part_that_is_refused_says_so() -> None:
+    setpoint = Setpoint(seq=1, base="drive", v_mps=0.3, gripper_m=1.0, pump=True)
+    assert check(setpoint, replace(GOOD, bump=True), NOW_S).refusal.count("; ") == 2
+
+
+@pytest.mark.parametrize("hazard", ["cliff", "bump"])
+def test_at_a_cliff_or_a_bump_turning_on_the_spot_is_free(hazard: str) -> None:
+    turning = Setpoint(seq=1, base="drive", omega_radps=0.5)
+    assert passes(turning, replace(GOOD, v_mps=0.0, **{hazard: True}))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_with_the_arm_out_the_slow_speeds_are_the_limit_both_ways(sign: float) -> None:
+    out = replace(GOOD, arm_rad=OUT, v_mps=sign * SLOW_MPS, omega_radps=sign * 0.6)
+    assert passes(Setpoint(seq=1, base="drive", v_mps=sign * 0.1, omega_radps=sign * 0.6), out)
+    assert "arm" in refused(Setpoint(seq=1, base="drive", v_mps=sign * 0.1001), out)
+    assert "arm" in refused(Setpoint(seq=1, base="drive", omega_radps=sign * 0.6001), out)
+
+
+def test_an_arm_just_at_its_limit_is_not_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "ARM_OUT_M", reach_m(OUT))
+    assert passes(DRIVE, replace(GOOD, arm_rad=OUT))
+    assert passes(structs.replace(DRIVE, arm=OUT, arm_s=3.0), GOOD)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_too_fast_either_way_is_scaled_to_the_limit(sign: float) -> None:
+    fast = replace(GOOD, v_mps=sign * 0.5, omega_radps=sign * 2.0)
+    ahead = check(Setpoint(seq=1, base="drive", v_mps=sign * 1.0), fast, NOW_S).command
+    round_ = check(Setpoint(seq=1, base="drive", omega_radps=sign * 8.0, v_mps=sign * 0.4), fast, NOW_S).command
+    assert (ahead.v_mps, ahead.omega_radps) == (sign * 0.5, 0.0)
+    assert (round_.v_mps, round_.omega_radps) == (pytest.approx(sign * 0.1), sign * 2.0)
+
+
+def test_the_bases_own_docking_is_told_no_speed() -> None:
+    for setpoint in (SEEK, structs.replace(SEEK, v_mps=0.3, omega_radps=1.0)):
+        assert check(setpoint, GOOD, NOW_S).command == Command(base="seek_dock")
+
+
+@pytest.mark.parametrize(
+    ("was", "wanted", "dt_s", "told"),
+    [
+        (0.0, 0.3, 0.02, 0.02),
+        (0.1, 0.3, 0.02, 0.12),
+        (0.29, 0.3, 0.02, 0.3),
+        (0.3, 0.1, 0.02, 0.1),
+        (0.3, -0.3, 0.02, -0.02),
+        (-0.3, 0.3, 0.02, 0.02),
+        (-0.1, -0.3, 0.02, -0.12),
+        (0.0, 0.3, 0.1, 0.1),
+        (0.0, 0.3, 5.0, 0.1),
+        (0.1, 0.3, 0.0, 0.1),
+        (0.1, 0.3, -1.0, 0.1),
+    ],
+)
+def test_speed_is_gained_by_one_metre_a_second_squared(was: float, wanted: float, dt_s: float, told: float) -> None:
+    command = check(Setpoint(seq=1, base="drive", v_mps=wanted), replace(GOOD, v_mps=was, dt_s=dt_s), NOW_S).command
+    assert command.v_mps == pytest.approx(told, abs=1e-12)
+
+
+def test_turning_is_gained_by_eight_radians_a_second_squared() -> None:
+    command = check(Setpoint(seq=1, base="drive", omega_radps=1.5), replace(GOOD, omega_radps=0.5), NOW_S).command
+    assert command.omega_radps == pytest.approx(0.66)
+
+
+@pytest.mark.parametrize(("arm_s", "allowed"), [(0.0, True), (30.0, True), (30.01, False), (-0.01, False)])
+def test_an_arm_move_takes_between_nothing_and_half_a_minute(arm_s: float, allowed: bool) -> None:
+    assert passes(Setpoint(seq=1, arm=OUT, arm_s=arm_s), DOCKED) == allowed
+
+
+def test_an_arm_move_is_stretched_to_what_its_slowest_joint_needs() -> None:
+    needed_s = (math.radians(150.0) - 0.85) / 2.0
+    for arm_s, told_s in ((0.0, needed_s), (0.5, needed_s), (3.0, 3.0)):
+        command = check(Setpoint(seq=1, arm=OUT, arm_s=arm_s), DOCKED, NOW_S).command
+        assert command.arm_s == pytest.approx(told_s)
+    wrist = (0.0, math.radians(150.0), math.radians(-150.0), math.radians(-60.0))
+    assert check(Setpoint(seq=1, arm=wrist), DOCKED, NOW_S).command.arm_s == pytest.approx(math.radians(120.0) / 2.0)
+    assert check(Setpoint(seq=1, arm=gardener.ARM_HOME_RAD), replace(DOCKED, arm_rad=None), NOW_S).command.arm_s == 0.0
+
+
+@pytest.mark.parametrize(("off_rad", "allowed"), [(0.05, True), (-0.05, True), (0.0501, False), (-0.0501, False)])
+def test_an_arm_of_unknown_place_goes_within_a_twentieth_of_a_radian_of_home(off_rad: float, allowed: bool) -> None:
+    goal = (off_rad, *gardener.ARM_HOME_RAD[1:])
+    assert passes(Setpoint(seq=1, arm=goal), replace(DOCKED, arm_rad=None)) == allowed
+
+
+@pytest.mark.parametrize(
+    ("setpoint", "allowed"),
+    [
+        (Setpoint(seq=1, gripper_m=0.0), True),
+        (Setpoint(seq=1, gripper_m=gardener.GRIPPER_OPEN_M), True),
+        (Setpoint(seq=1, gripper_m=-1e-6), False),
+        (Setpoint(seq=1, gripper_m=gardener.GRIPPER_OPEN_M + 1e-6), False),
+        (Setpoint(seq=1, roll_rad=gardener.ROLL_SERVO.min_rad), True),
+        (Setpoint(seq=1, roll_rad=gardener.ROLL_SERVO.max_rad), True),
+        (Setpoint(seq=1, roll_rad=gardener.ROLL_SERVO.min_rad - 1e-6), False),
+        (Setpoint(seq=1, roll_rad=gardener.ROLL_SERVO.max_rad + 1e-6), False),
+    ],
+)
+def test_fingers_and_wrist_keep_to_their_ranges(setpoint: Setpoint, allowed: bool) -> None:
+    assert passes(setpoint, GOOD) == allowed
+    if allowed:
+        command = check(setpoint, GOOD, NOW_S).command
+        assert (command.gripper_m, command.roll_rad) == (setpoint.gripper_m, setpoint.roll_rad)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_roll_that_is_no_number_moves_nothing(value: float) -> None:
+    assert "not finite" in refused(Setpoint(seq=1, base="drive", v_mps=0.1, roll_rad=value), GOOD)
+
+
+@pytest.mark.parametrize(
+    ("change", "allowed"),
+    [
+        ({"tank_ml": 5.0}, False),
+        ({"tank_ml": 5.01}, True),
+        ({"tank_ml": None}, True),
+        ({"omega_radps": 0.1}, False),
+        ({"v_mps": -0.1}, False),
+        ({"dose": Dose(debited_ml=50.0, delivered_ml=49.95)}, False),
+        ({"dose": Dose(debited_ml=50.0, delivered_ml=49.94)}, True),
+        ({"dose": Dose(debited_ml=1.0, delivered_ml=0.0)}, True),
+        ({"dose": Dose(debited_ml=50.0, refusal="the cap is reached")}, True),
+    ],
+)
+def test_the_pump_runs_until_its_dose_is_out_and_only_standing(change: dict[str, object], allowed: bool) -> None:
+    verdict = check(PUMP, replace(IN_HAND, **change), NOW_S)  # type: ignore[arg-type]
+    assert (verdict.command.pump, bool(verdict.refusals), verdict.debit_ml) == (allowed, not allowed, 0.0)
+
+
+def test_whoever_wants_to_drive_does_not_pump_even_before_it_moves() -> None:
+    verdict = check(structs.replace(PUMP, base="drive", v_mps=0.0), IN_HAND, NOW_S)
+    assert (verdict.command.pump, verdict.refusal) == (False, "the pump runs only while the base stands")
+
+
+def test_a_dose_of_a_single_millilitre_is_a_dose() -> None:
+    assert check(structs.replace(PUMP, dose_ml=1.0), DOCKED, NOW_S).debit_ml == 1.0
 
 
 # Random sequences
