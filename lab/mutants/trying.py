@@ -7,6 +7,7 @@ is taken for one that never ends; that counts as noticed.
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -19,7 +20,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -61,10 +62,12 @@ class Watched:
     modules: list[str] = field(default_factory=list)
     """Of others, that the tests import: loaded once for all mutants."""
 
-    def tests_of(self, file: str, mutant: Mutant) -> list[str]:
-        """Those that run the mutant's statement, the quickest first; all, when it runs at import."""
-        wanted = set(mutant.lines)
-        seen = [test for test in self.took_s if not wanted or wanted & set(self.lines[test].get(file, ()))]
+    def tests_of(self, file: str, mutant: Mutant, users: Collection[str]) -> list[str]:
+        """Those that run the mutant's statement, the quickest first; when it runs at import, all that run one of `users`."""
+        if mutant.lines:
+            seen = [test for test in self.took_s if set(mutant.lines) & set(self.lines[test].get(file, ()))]
+        else:
+            seen = [test for test in self.took_s if self.lines[test].keys() & set(users)]
         return sorted(seen, key=lambda test: (self.took_s[test], test))
 
 
@@ -92,7 +95,7 @@ class Trial:
 
     def try_one(self, file: str, mutant: Mutant) -> Outcome:
         """What the tests say to a mutant of one of the part's files."""
-        tests = self.watched.tests_of(file, mutant)
+        tests = self.watched.tests_of(file, mutant, _users(self._root, self._part.files, file))
         if not tests:
             return "unreached"
         source = mutant.put_into((self._root / file).read_bytes())
@@ -240,6 +243,21 @@ class _Watcher:
 @cache
 def _lines_of(code: CodeType) -> frozenset[int]:
     return frozenset(line for _, _, line in code.co_lines() if line)
+
+
+@cache
+def _users(root: Path, files: tuple[str, ...], file: str) -> frozenset[str]:
+    """The file, and those of `files` that import it, directly or through others."""
+    found, before = {file}, set[str]()
+    while found != before:
+        before, names = set(found), {_module(each) for each in found}
+        found |= {each for each in files if _imported((root / each).read_text()) & names}
+    return frozenset(found)
+
+
+def _imported(source: str) -> set[str]:
+    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
+    return {name for node in nodes for name in (node.module or "", *(f"{node.module}.{each.name}" for each in node.names))}
 
 
 def _module(file: str) -> str:
