@@ -8,7 +8,7 @@ import pytest
 
 from core.allocation.bidding import Condition, Stop, queue_s
 from core.allocation.queue import Entry, TaskQueue
-from core.allocation.reorder import better_order, shortest_found
+from core.allocation.reorder import _neighbours, better_order, shortest_found
 
 
 def travel(place, dock):
@@ -72,6 +72,54 @@ def test_local_search_ends_near_the_shortest_of_all_orders(tail):
         lengths = [sum(legs[a][b] for a, b in pairwise([0, *p, *ends])) for p in permutations(range(1, 6))]
         found = shortest_found(legs, 5)
         assert sum(legs[a][b] for a, b in pairwise([0, *found, *ends])) <= 1.1 * min(lengths)
+
+
+def test_the_way_on_to_what_comes_after_counts():
+    """10 and 20 are on the way to 30, which is more urgent than nothing but stays last: its priority is lower."""
+    me = robot(stop("20"), stop("10"), stop("30", priority=3))
+    assert better_order(me) == [1, 0, 2]
+    back = robot(stop("10"), stop("20"), stop("0", priority=3))
+    assert better_order(back) == [0, 1, 2]
+
+
+def test_the_way_begins_where_the_robot_will_be():
+    there = replace(robot(stop("10"), stop("30")), docked_at="40")
+    assert better_order(there) == [1, 0]
+    busy = replace(robot(stop("10"), stop("30")), current=stop("40"))
+    assert better_order(busy) == [1, 0]
+    settled = robot(stop("40", settled=True), stop("10"), stop("30"))
+    assert better_order(settled) == [0, 2, 1]
+
+
+def test_a_gain_of_one_second_is_worth_it_and_less_is_not():
+    """Two tasks on one side: the other order saves twice the way between them, less the way back."""
+    for gap, order in ((1.0, [1, 0]), (0.999, [0, 1])):
+        assert better_order(robot(stop(f"{10.0 + gap}"), stop("10.0"))) == order
+
+
+def test_a_stop_without_a_dock_is_not_moved_nor_what_is_before_it():
+    me = robot(stop("30"), Stop(dock="", refill=True), stop("20"), stop("10"))
+    assert better_order(replace(me, taps=("0",), tank_ml=1500.0)) == [0, 1, 3, 2]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_a_few_places_are_put_in_their_shortest_order(count):
+    legs = [[abs(a - b) for b in (0.0, 3.0, 1.0, 2.0)[: count + 1]] for a in (0.0, 3.0, 1.0, 2.0)[: count + 1]]
+    assert shortest_found(legs, count) == [[], [1], [2, 1], [2, 3, 1]][count]
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 6])
+def test_the_neighbours_of_an_order_are_all_turned_and_all_shifted_parts(size):
+    path = list(range(size))
+    turned = {(*path[:i], *path[i:j][::-1], *path[j:]) for i in range(size) for j in range(i + 2, size + 1)}
+    shifted = set()
+    for length in range(1, min(3, size - 1) + 1):
+        for i in range(size - length + 1):
+            rest = path[:i] + path[i + length :]
+            shifted |= {(*rest[:k], *path[i : i + length], *rest[k:]) for k in range(len(rest) + 1)}
+    found = [tuple(each) for each in _neighbours(path)]
+    assert set(found) == (turned | shifted) - {tuple(path)}
+    assert tuple(path) not in found
 
 
 def test_a_queue_is_arranged_behind_what_runs():

@@ -14,13 +14,15 @@ from core.allocation.bidding import (
     done_s,
     insertion,
     price,
+    queue_s,
     refill_s,
+    ride_s,
     total_s,
     work_s,
 )
 from core.robots import gardener
 from core.wire.geometry import Point3, Pose2
-from core.wire.market import Announcement, PlantCard
+from core.wire.market import Announcement, Breakdown, PlantCard
 
 PLACES = {"here": 0.0, "near": 10.0, "far": 40.0, "tap": 20.0, "spare": 30.0}
 
@@ -212,3 +214,108 @@ def test_the_largest_dose_is_taken_but_more_than_a_tankful_is_refused():
     largest = asked(dose_ml=500.0)
     assert price(largest, ME).cost_s is not None
     assert "tank holds" in price(largest.model_copy(update={"dose_ml": 2 * gardener.TANK_ML}), ME).reason
+
+
+def test_the_figures_that_prices_are_made_of():
+    assert work_s("water", 150.0) == pytest.approx(6.0 + 6.0 + 20.0 + 1.5)
+    assert work_s("inventory", 0.0) == 30.0
+    assert [work_s("harvest", 0.0, count) for count in (0, 1, 3)] == [27.0, 27.0, 57.0]
+    assert ride_s(3.0) == pytest.approx(1.15 * 10.0 + 3.0)
+    assert charge_s(0.1) == pytest.approx((0.40 - 0.1) * 130.0 * 3600.0 / 60.0)
+    assert charge_s(0.1, 0.2) == pytest.approx(0.1 * 130.0 * 3600.0 / 60.0)
+    assert (charge_s(0.4), charge_s(0.9)) == (0.0, 0.0)
+    assert [refill_s(tank_ml) for tank_ml in (1500.0, 1440.0, 1501.0)] == [0.0, 2.0, 0.0]
+    assert (DOCKING_S, UNDOCKING_S, REST_MIN_S) == (12.0, 6.0, 5.0)
+
+
+def test_a_pack_is_flat_below_a_twentieth_and_charged_first_below_fifteen_hundredths():
+    assert "battery flat at 4%" in price(asked(), replace(ME, battery_ratio=0.0449)).reason
+    assert price(asked(), replace(ME, battery_ratio=0.05)).breakdown.charge_s > 0.0
+    assert price(asked(), replace(ME, battery_ratio=0.01, docked_at="spare")).breakdown.charge_s > 0.0
+    assert price(asked(), replace(ME, battery_ratio=0.1499)).breakdown.charge_s > 0.0
+    assert price(asked(), replace(ME, battery_ratio=0.15)).breakdown.charge_s == 0.0
+
+
+def test_charging_on_the_way_costs_the_way_there_what_the_way_took_and_the_time_on_the_dock():
+    bid = price(asked(), replace(ME, battery_ratio=0.12))
+    left = 0.12 - (30.0 + 12.0) * (12.0 + 18.0) / (130.0 * 3600.0)
+    assert bid.breakdown.charge_s == pytest.approx(30.0 + 12.0 + charge_s(left))
+    assert bid.breakdown.travel_s == pytest.approx(6.0 + 20.0 + 12.0)
+
+
+def test_work_takes_from_the_pack_as_well():
+    """A quarter of an hour with the arm out, and the next task needs a charge first."""
+    long = Stop(dock="near", work_s=900.0, settled=True)
+    used = (22.0 * (12.0 + 18.0) + 900.0 * (12.0 + 6.0)) / (130.0 * 3600.0)
+    enough, short = (replace(ME, battery_ratio=0.15 + used + spare, queue=(long,)) for spare in (1e-6, -1e-6))
+    assert price(asked("spare"), enough).breakdown.charge_s == 0.0
+    assert price(asked("spare"), short).breakdown.charge_s > 0.0
+
+
+def test_a_dose_leaves_a_reserve_in_the_tank():
+    assert price(asked(dose_ml=150.0), replace(ME, tank_ml=180.0)).breakdown.refill_s == 0.0
+    assert price(asked(dose_ml=150.0), replace(ME, tank_ml=179.0)).breakdown.refill_s == pytest.approx(
+        20.0 + 12.0 + refill_s(179.0)
+    )
+    fullest = asked(dose_ml=1.0).model_copy(update={"dose_ml": gardener.TANK_ML - 30.0})
+    assert price(fullest, ME).cost_s is not None
+    assert price(fullest.model_copy(update={"dose_ml": gardener.TANK_ML - 29.0}), ME).cost_s is None
+
+
+def test_what_is_no_watering_needs_no_water_and_no_sensor_of_it():
+    scan = asked(dose_ml=0.0).model_copy(update={"kind": "inventory"})
+    me = replace(ME, can=frozenset({"inventory"}), tank_ml=None)
+    assert price(scan, me).breakdown.refill_s == 0.0
+    assert price(scan, me).breakdown.work_s == 30.0
+    assert price(scan, ME).reason == "cannot inventory: not fitted for it"
+
+
+def test_an_errand_takes_as_long_as_tank_and_pack_need():
+    tap, spare = Stop(dock="", refill=True, work_s=1000.0), Stop(dock="", charge=True, work_s=1000.0)
+    assert queue_s(replace(ME, tank_ml=900.0), [tap]) == pytest.approx(20.0 + 12.0 + 20.0)
+    charged = replace(ME, battery_ratio=0.3)
+    left = 0.3 - 42.0 * 30.0 / (130.0 * 3600.0)
+    assert queue_s(charged, [spare]) == pytest.approx(30.0 + 12.0 + charge_s(left))
+    assert queue_s(charged, [spare, spare]) == pytest.approx(30.0 + 12.0 + charge_s(left)), "it has enough, and is there"
+    assert queue_s(replace(ME, tank_ml=900.0), [tap, tap]) == pytest.approx(20.0 + 12.0 + 20.0)
+    assert queue_s(ME, [Stop(dock="nowhere", work_s=1.0)]) is None
+    assert queue_s(replace(ME, taps=()), [Stop(dock="near", dose_ml=990.0, work_s=1.0)]) is None
+
+
+def test_the_nearest_tap_is_soonest_reached_and_ties_go_by_name():
+    thirsty = replace(ME, tank_ml=0.0, taps=("far", "nowhere", "spare", "tap"))
+    assert price(asked(), thirsty).breakdown.refill_s == pytest.approx(20.0 + 12.0 + 50.0)
+    there = replace(thirsty, docked_at="far")
+    assert price(asked(), there).breakdown.refill_s == pytest.approx(50.0), "it stands there"
+
+
+def test_a_queue_that_cannot_be_done_takes_nothing_more_and_says_what_it_cannot_reach():
+    barred = replace(ME, queue=(Stop(dock="nowhere", work_s=1.0, task_id="x"),))
+    assert price(asked(), barred).reason == "no way to nowhere, which is in the queue"
+
+
+def test_a_chain_of_doses_is_reckoned_the_same_in_one_go_and_stop_by_stop():
+    """Behind a task put in: while the tank lasts a sum is enough, after that each stop is walked to."""
+    dry = [Stop(dock=dock, work_s=10.0, dose_ml=100.0, task_id=dock) for dock in ("far", "spare", "tap")]
+    for tank_ml in (1500.0, 430.0, 429.0, 200.0):
+        me = replace(ME, tank_ml=tank_ml, queue=tuple(dry))
+        task = asked("near", dose_ml=100.0)
+        bid = price(task, me)
+        at, stop = insertion(task, me), Stop(dock="near", work_s=work_s("water", 100.0), dose_ml=100.0)
+        with_it = queue_s(me, [*dry[:at], stop, *dry[at:]])
+        put_off = len(dry) - at + 1
+        assert bid.breakdown.delay_s == pytest.approx(put_off * (with_it - queue_s(me, dry))), tank_ml
+
+
+def test_a_place_that_cannot_be_is_no_place_when_another_can():
+    """Nothing reaches a charger by itself, but the queue goes to one: behind it all is well."""
+    weak = replace(ME, battery_ratio=0.12, chargers=(), queue=(Stop(dock="spare", charge=True),))
+    assert insertion(asked(), weak) == 1
+    assert price(asked(), weak).cost_s is not None
+
+
+def test_what_is_running_is_bid_for_with_its_rest_and_nothing_else():
+    at_it = replace(ME, docked_at="near", current=Stop(dock="near", work_s=25.0, task_id="near:1"), at_work_s=5.0)
+    bid = price(asked(), replace(at_it, queue=(Stop(dock="far", work_s=9.0, task_id="far:1"),)))
+    assert (bid.cost_s, bid.breakdown.current_s, insertion(asked(), at_it)) == (20.0, 20.0, 0)
+    assert bid.breakdown.model_dump() == Breakdown(current_s=20.0).model_dump()

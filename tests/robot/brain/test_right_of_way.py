@@ -6,7 +6,24 @@ import random
 import pytest
 from plane import TOUCH_M, free_poses, walk
 
-from core.allocation.right_of_way import KEEP_M, Other, goes_first, growth_m, in_the_way_of, route_gap_m, speed_limit_mps
+from core.allocation.right_of_way import (
+    BRAKE_S,
+    CLEAR_M,
+    KEEP_M,
+    RANK_BUSY,
+    RANK_DRIVING,
+    RANK_IDLE,
+    ROUTE_M,
+    SILENT_S,
+    Other,
+    along,
+    goes_first,
+    growth_m,
+    in_the_way_of,
+    keep_m,
+    route_gap_m,
+    speed_limit_mps,
+)
 from core.robots.garden_map import GardenMap, KnownPot, map_of
 from core.scenario import find
 
@@ -106,3 +123,124 @@ def test_the_distance_to_a_route_is_that_to_its_nearest_point():
     assert route_gap_m((0.5, 0.2), [(0.0, 0.0), (1.0, 0.0)]) == pytest.approx(0.2)
     assert route_gap_m((2.0, 0.0), [(0.0, 0.0), (1.0, 0.0)]) == pytest.approx(1.0)
     assert route_gap_m((0.0, 0.0), []) == math.inf
+
+
+def other(**more):
+    return Other(robot_id="robot-2", **({"x_m": 1.0, "y_m": 0.0} | more))
+
+
+def test_the_distances_and_times_are_these():
+    assert pytest.approx(2 * 0.174 + 0.10) == KEEP_M
+    assert (SILENT_S, BRAKE_S, CLEAR_M, ROUTE_M) == (5.0, 0.6, 0.06, 1.5)
+    assert (RANK_BUSY, RANK_DRIVING, RANK_IDLE) == (0, 1, 2)
+    quiet = Other(robot_id="robot-2", x_m=0.0, y_m=0.0)
+    assert (quiet.v_mps, quiet.moving, quiet.docked, quiet.rank, quiet.route, quiet.age_s) == (0.0, False, False, 2, (), 0.0)
+
+
+def test_five_seconds_without_a_word_are_not_silence_yet():
+    assert not other(age_s=5.0).silent
+    assert other(age_s=5.01).silent
+
+
+def test_ones_own_equal_does_not_go_second():
+    assert not goes_first((2, "robot-2"), other(rank=2))
+
+
+@pytest.mark.parametrize(
+    ("told", "growth"),
+    [
+        ({"age_s": 1.0}, 0.15),
+        ({"age_s": 1.9}, 0.285),
+        ({"age_s": 2.1}, 0.30),
+        ({"age_s": 0.5, "moving": True}, 0.15),
+        ({"age_s": 0.5, "moving": True, "v_mps": 0.4}, 0.20),
+        ({"age_s": 1.0, "docked": True}, 0.0),
+        ({"age_s": 0.5, "docked": True, "moving": True}, 0.15),
+        ({"age_s": 1.0, "v_mps": 0.4}, 0.15),
+    ],
+)
+def test_how_far_it_may_have_come_by_now(told, growth):
+    assert growth_m(other(**told)) == pytest.approx(growth)
+    assert keep_m(other(**told)) == pytest.approx(KEEP_M + growth)
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.7, -2.0])
+@pytest.mark.parametrize("forward", [True, False])
+def test_the_speed_left_is_what_stops_within_the_braking_time_along_the_heading(yaw_rad, forward):
+    heading = yaw_rad if forward else yaw_rad + math.pi
+    for off_rad in (0.0, 0.3, -0.3):
+        ahead = other(x_m=2.0 + math.cos(heading + off_rad), y_m=-1.0 + math.sin(heading + off_rad))
+        limit_mps, by = speed_limit_mps((2.0, -1.0, yaw_rad), forward, [ahead])
+        assert limit_mps == pytest.approx((1.0 - KEEP_M) / 0.6 / math.cos(off_rad))
+        assert by == "robot-2"
+
+
+def test_who_will_be_passed_at_a_distance_or_is_behind_limits_nobody():
+    here = (0.0, 0.0, 0.0)
+    assert speed_limit_mps(here, True, [other(y_m=KEEP_M + 1e-6)]) == (math.inf, "")
+    assert speed_limit_mps(here, True, [other(y_m=KEEP_M - 0.001)])[0] < math.inf
+    assert speed_limit_mps(here, True, [other(x_m=0.0, y_m=0.2)]) == (math.inf, "")
+    assert speed_limit_mps(here, True, [other(x_m=-0.001, y_m=0.2)]) == (math.inf, "")
+    assert speed_limit_mps(here, True, [other(x_m=0.0)]) == (math.inf, "")
+    assert speed_limit_mps(here, True, []) == (math.inf, "")
+
+
+def test_the_nearest_limits_most_whatever_the_order_and_those_passed_by_do_not_end_the_search():
+    near, far = other(), Other(robot_id="robot-3", x_m=2.0, y_m=0.0)
+    aside, behind = Other(robot_id="robot-4", x_m=1.0, y_m=2.0), Other(robot_id="robot-5", x_m=-1.0, y_m=0.0)
+    for others in ([near, far], [far, near], [aside, behind, near]):
+        assert speed_limit_mps((0.0, 0.0, 0.0), True, others) == (pytest.approx((1.0 - KEEP_M) / 0.6), "robot-2")
+    twin = Other(robot_id="robot-9", x_m=1.0, y_m=0.0)
+    assert speed_limit_mps((0.0, 0.0, 0.0), True, [near, twin])[1] == "robot-2"
+
+
+@pytest.mark.parametrize(
+    ("point", "gap_m"),
+    [
+        ((0.0, 0.0), 1.0),
+        ((2.0, 1.0), 1.0),
+        ((2.0, 2.5), 0.5),
+        ((4.0, 5.0), 1.0),
+        ((5.0, 5.0), math.sqrt(2.0)),
+        ((3.0, 3.0), 0.0),
+        ((2.5, 2.5), 0.5),
+    ],
+)
+def test_the_distance_to_a_bent_route(point, gap_m):
+    route = [(1.0, 0.0), (1.0, 1.0), (1.0, 2.0), (1.0, 3.0), (4.0, 3.0), (4.0, 4.0)]
+    assert route_gap_m(point, route) == pytest.approx(gap_m)
+
+
+def test_the_distance_to_a_route_of_one_point_or_of_one_point_twice_is_that_to_the_point():
+    assert route_gap_m((4.0, 6.0), [(1.0, 2.0)]) == pytest.approx(5.0)
+    assert route_gap_m((4.0, 6.0), [(1.0, 2.0), (1.0, 2.0)]) == pytest.approx(5.0)
+    assert route_gap_m((0.0, 1.0), [(1.0, 2.0), (3.0, 3.0)]) == pytest.approx(math.sqrt(2.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "in_way"),
+    [
+        ({}, True),
+        ({"age_s": 6.0}, False),
+        ({"docked": True}, True),
+        ({"docked": True, "route": ()}, False),
+        ({"route": ()}, False),
+        ({"rank": 2, "robot_id": "robot-3"}, False),
+        ({"rank": 2}, True),
+        ({"route": ((0.0, KEEP_M), (1.0, KEEP_M))}, False),
+        ({"route": ((0.0, KEEP_M - 0.001), (1.0, KEEP_M - 0.001))}, True),
+    ],
+)
+def test_whose_route_one_must_leave(change, in_way):
+    told = {"robot_id": "robot-1", "x_m": 1.0, "y_m": 0.0, "rank": 1, "route": ((1.0, 0.0), (0.0, 0.0))} | change
+    passing = Other(**told)
+    assert in_the_way_of((2, "robot-2"), (0.0, 0.0, 0.0), [passing]) is (passing if in_way else None)
+
+
+def test_points_along_a_route_are_as_near_as_was_asked_and_end_where_it_ends():
+    assert along([]) == []
+    assert along([(1.0, 2.0)]) == [(1.0, 2.0)]
+    assert along([(0.0, 0.0), (0.0, 0.0)]) == [(0.0, 0.0), (0.0, 0.0)]
+    bent = along([(1.0, 1.0), (1.0, 1.25), (0.5, 1.25)], 0.125)
+    assert bent == [(1.0, 1.0), (1.0, 1.125), (1.0, 1.25), (0.875, 1.25), (0.75, 1.25), (0.625, 1.25), (0.5, 1.25)]
+    assert len(along([(0.0, 0.0), (1.0, 0.0)])) == 11
