@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.allocation.picking import PICK_S_MAX, Picking
+from core.allocation.picking import PICK_S_MAX, OpenPick, Picking, may_be_picked, settles, told
 from core.allocation.plant_side import Market
 from core.allocation.plant_state import Grant, Kill, MarketDocument, Solicit
 from core.errors import Conflict, Refused
@@ -128,6 +128,86 @@ def test_some_of_the_wanted_fruit_is_done_with_the_reason_for_the_rest() -> None
     tell(made, task_id, 3.0, "done", pick("f1", permit_id=first.permit_id), pick("f2", "unreachable", reason="too high"))
     assert made.task(task_id).state == "done"
     assert "1 of 2 picked" in made.task(task_id).reason
+
+
+@pytest.mark.parametrize(
+    ("change", "may"),
+    [
+        ({}, True),
+        ({"confidence": 0.6}, True),
+        ({"confidence": 0.59}, False),
+        ({"sigma_m": 0.03}, True),
+        ({"sigma_m": 0.031}, False),
+        ({"unreachable": "too high"}, False),
+        ({"failed": "slipped"}, False),
+        ({"in_doubt": True}, False),
+    ],
+)
+def test_a_hand_is_sent_only_for_what_is_known_well_enough(change: dict[str, Any], may: bool) -> None:
+    assert may_be_picked(fruit("f1", **change)) == may
+
+
+def test_the_times_of_a_pick_are_reckoned_from_its_permit() -> None:
+    held = OpenPick(permit=Permit(permit_id="p", task_id="t", epoch=1, act="pick", fruit_id="f1", valid_for_s=15.0),
+                    robot_id="robot-1", issued_s=1000.0)  # fmt: skip
+    assert (held.act_over_s(), held.key) == (1075.0, "")
+    assert [held.again(now_s).valid_for_s for now_s in (990.0, 1000.0, 1004.0, 1020.0)] == [15.0, 15.0, 11.0, 0.0]
+    woken = Picking(held, [held], 50.0)
+    assert woken.open is not None
+    assert (woken.open.issued_s, woken.doubts["f1"].issued_s, woken.clear_s()) == (50.0, 50.0, 125.0)
+    assert (woken.undecided(124.9), woken.undecided(125.0)) == (["f1", "f1"], ["f1"])
+    assert (Picking(None, [], 0.0).clear_s(), Picking(None, [], 0.0).undecided(0.0)) == (0.0, [])
+
+
+def test_a_permit_is_held_by_its_robot_alone_and_known_by_its_name() -> None:
+    held = OpenPick(permit=Permit(permit_id="p", task_id="t", epoch=1, act="pick", fruit_id="f1", valid_for_s=15.0),
+                    robot_id="robot-1", issued_s=0.0)  # fmt: skip
+    other = held.model_copy(update={"permit": held.permit.model_copy(update={"permit_id": "q", "fruit_id": "f2"})})
+    picks = Picking(held, [other], 0.0)
+    assert [picks.holds(*who) for who in (("t", "robot-1", 1), ("t", "robot-1", 2), ("t", "robot-2", 1))] == [
+        True,
+        False,
+        False,
+    ]
+    assert not Picking(None, [other], 0.0).holds("t", "robot-1", 1)
+    assert (picks.held("p", "robot-1"), picks.held("q", "robot-1")) == (picks.open, picks.doubts["f2"])
+    assert (picks.held("p", "robot-2"), picks.held("", "robot-1"), picks.held("r", "robot-1")) == (None, None, None)
+    assert [settles(picks.open, pick(name, how), picks.open) for name, how in (("f1", "failed"), ("f2", "picked"))] == [
+        True,
+        False,
+    ]
+    doubt = picks.doubts["f2"]
+    assert [settles(doubt, pick("f2", how), picks.open) for how in ("picked", "failed")] == [True, False]
+    assert [settles(doubt, pick("f2", how), None) for how in ("picked", "failed")] == [True, False]
+    assert not settles(None, pick("f1"), picks.open)
+    picks.close(doubt)
+    assert (picks.open is None, list(picks.doubts)) == (False, [])
+    picks.close(held)
+    assert picks.open is None
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [("f9", "f9 is not in the inventory"), ("", "a fruit without a name"), ("f4", "not for"), ("f3", "not for"), ("f2", "")],
+)
+def test_a_pick_is_refused_and_says_why(name: str, why: str) -> None:
+    made = market("f1 f2 f3 f4")
+    made.fruits([fruit("f1"), fruit("f2"), fruit("f3", unreachable="too high"), fruit("f4")], 0.0)
+    task_id = harvest(made)
+    if not why:
+        assert permit(made, task_id, name, 1.0).fruit_id == name
+        return
+    with pytest.raises(Refused, match=why):
+        permit(made, task_id, name, 1.0)
+
+
+def test_how_a_harvest_went_is_told_in_a_sentence_of_bounded_length() -> None:
+    made = market()
+    task = made.ask("harvest", 0.0, "fruit", "ripe", 0.0, fruit_ids=["f1", "f2", "f3"], count=2)
+    picks = [pick("f1"), pick("f2", "failed", reason="slipped"), pick("f3", "unreachable")]
+    said = told(task.model_copy(update={"picks": picks}))
+    assert said == "1 of 2 picked; f2 failed: slipped; f3 unreachable: no reason given"
+    assert len(told(task.model_copy(update={"picks": [pick("f2", "failed", reason="x" * 499)]}))) == 500
 
 
 def silent_after_permit(made: Market) -> tuple[str, Permit]:

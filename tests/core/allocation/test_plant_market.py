@@ -9,14 +9,16 @@ from typing import Any
 
 import pytest
 
-from core.allocation.auction import Round, better_than_holder, cheapest, no_bid
-from core.allocation.epochs import owner_of
-from core.allocation.permits import DAY_S, Dose, given_ml, revived, rise_needed
+from core.allocation import permits
+from core.allocation.auction import Round, better_than_holder, cheapest, no_bid, told, worth_s
+from core.allocation.epochs import Names, owner_of
+from core.allocation.permits import DAY_S, Dose, OpenPermit, given_ml, revived, rise_needed
 from core.allocation.plant_side import Market
 from core.allocation.plant_state import Grant, Kill, Limits, MarketDocument, Solicit
+from core.allocation.watering import Measured
 from core.errors import Conflict, NotFound, Refused
 from core.wire.geometry import Point3, Pose2
-from core.wire.market import Bid, PermitRequest, PlantCard, Report
+from core.wire.market import Bid, Permit, PermitRequest, PlantCard, Report
 
 CARD = PlantCard(
     plant_id="plant-1", url="http://plant-1", stem=Point3(x_m=0.0, y_m=0.0, z_m=0.25),
@@ -101,6 +103,81 @@ def test_doses_of_an_old_document_count_for_a_day_also_when_the_clock_began_anew
 def test_the_rise_asked_for_is_below_what_a_dose_does() -> None:
     assert all(rise_needed(ml) <= 0.5 * ml / 3000.0 for ml in (30.0, 60.0, 150.0, 500.0))
     assert rise_needed(500.0) == 0.01
+
+
+def test_a_dose_counts_for_a_day_to_the_second_and_is_corrected_by_its_permit() -> None:
+    doses = [Dose(permit_id="a", t_s=100.0, ml=100.0), Dose(permit_id="b", t_s=200.0, ml=50.0)]
+    assert (given_ml(doses, 100.0 + DAY_S), given_ml(doses, 99.0 + DAY_S)) == (50.0, 150.0)
+    assert (permits.recent(doses, 100.0 + DAY_S), permits.recent(doses, 99.0 + DAY_S)) == (doses[1:], doses)
+    assert [dose.ml for dose in permits.corrected(doses, "b", 10.0)] == [100.0, 10.0]
+    assert DAY_S == 24 * 3600
+
+
+def test_a_dose_that_was_in_the_future_counts_from_now_when_nobody_knows_the_clock_of_before() -> None:
+    doses = [Dose(permit_id="a", t_s=50.0, ml=100.0), Dose(permit_id="b", t_s=5000.0, ml=50.0)]
+    assert [dose.t_s for dose in revived(doses, None, 100.0)] == [50.0, 100.0]
+    assert [dose.t_s for dose in revived(doses, 6000.0, 100.0)] == [-5850.0, -900.0]
+
+
+def test_the_times_of_a_dose_are_reckoned_from_its_permit() -> None:
+    assert permits.longest_act_s(150.0) == 150.0 / 5.0 + 5.0
+    held = OpenPermit(permit=Permit(permit_id="p", task_id="t", epoch=1, act="water", dose_ml=150.0, valid_for_s=15.0),
+                      robot_id="robot-1", issued_s=1000.0, before_ratio=0.1)  # fmt: skip
+    assert (held.valid_until_s(), held.act_over_s()) == (1015.0, 1050.0)
+    assert [held.again(now_s).valid_for_s for now_s in (990.0, 1000.0, 1004.0, 1020.0)] == [15.0, 15.0, 11.0, 0.0]
+    assert (held.key, held.finished, permits.PERMIT_VALID_S, permits.DOSE_ML_MIN) == ("", False, 15.0, 30.0)
+
+
+@pytest.mark.parametrize(("dose_ml", "rise"), [(30.0, 0.004), (60.0, 0.004), (90.0, 0.006), (120.0, 0.008), (500.0, 0.01)])
+def test_a_rise_is_a_fifth_of_what_a_dose_does_between_two_bounds(dose_ml: float, rise: float) -> None:
+    assert rise_needed(dose_ml) == pytest.approx(rise)
+
+
+def test_a_rise_that_is_just_enough_is_enough() -> None:
+    held = OpenPermit(permit=Permit(permit_id="p", task_id="t", epoch=1, act="water", dose_ml=500.0, valid_for_s=15.0),
+                      robot_id="robot-1", issued_s=0.0, before_ratio=0.0)  # fmt: skip
+    assert Measured(held, 0.01).arrived
+    assert not Measured(held, 0.0099).arrived
+    assert (Measured(held, 0.01).rise, Measured(held, 0.01).told) == (0.01, "soil went from 0.000 to 0.010")
+
+
+def test_names_count_up_and_an_id_is_known_by_its_form() -> None:
+    names = Names("plant-1", 3)
+    assert [names.next(), names.next("p"), names.next()] == ["plant-1:3:1", "plant-1:3:p2", "plant-1:3:3"]
+    assert [owner_of(text) for text in ("plant-1:3:p2", "plant-1:x:2", "plant-1:3:", "plant-1:3", "")] == [
+        "plant-1",
+        "",
+        "",
+        "",
+        "",
+    ]
+
+
+def test_a_bid_for_another_task_or_in_another_name_is_none_and_says_so() -> None:
+    asked = Round(number=1, asked=frozenset({"a", "b", "c"}), deadline_s=2.0)
+    asked.take("b", bid("a", 1.0), "t")
+    asked.take("a", bid("a", 1.0, "other"), "t")
+    assert not asked.complete
+    told_ = [(each.robot_id, each.cost_s, each.reason) for each in asked.bids("t")]
+    wrong = "answered for another robot or task"
+    assert told_ == [("a", None, wrong), ("b", None, wrong), ("c", None, "did not answer")]
+    assert no_bid("t", "a", "x" * 600).reason == "x" * 500
+    assert asked.purpose == "award"
+
+
+def test_nobody_can_is_told_robot_by_robot() -> None:
+    silent = Bid(task_id="t", robot_id="c", cost_s=None)
+    assert told([bid("a", None), bid("b", 1.0), silent]) == "a: unable; c: no reason given"
+    assert told([]) == "no robot is known"
+
+
+def test_a_bid_of_nothing_at_all_is_a_bid() -> None:
+    assert cheapest([bid("a", 0.0), bid("b", 1.0)]) == bid("a", 0.0)
+    assert better_than_holder([bid("a", 10.0), bid("b", 0.0)], "a", 0.2) == bid("b", 0.0)
+    assert better_than_holder([bid("a", 0.0), bid("b", 0.0)], "a", 0.2) is None
+    assert better_than_holder([bid("b", 0.0)], "a", 0.2) is None
+    assert better_than_holder([bid("a", 5.0), bid("b", None)], "a", 0.2) is None
+    assert worth_s([bid("a", 0.0), bid("b", 0.0)], bid("a", 0.0), 0.2) == 0.0
 
 
 def test_an_award_waits_for_nobody_but_the_disk() -> None:
