@@ -21,7 +21,7 @@ from core.mesh.auth import ANYBODY, ROLES, Caller, Verifier
 from core.mesh.describe import describe, docs_page
 from core.mesh.direct import route_of, run_directly
 from core.mesh.events import EventLog
-from core.mesh.guard import Guard, bearer, request_counter
+from core.mesh.guard import Guard, caller_of, request_counter
 from core.mesh.peers import Peers
 from core.mesh.problems import problem_response
 from core.mesh.strict import body, no_surplus, parse, plain_read, raw
@@ -64,7 +64,7 @@ class Allow:
         verifier: Verifier | None = state.verifier
         if verifier is None:
             return ANYBODY
-        caller = verifier.verify(bearer(scope["headers"]), state.clock.now())
+        caller = caller_of(scope, verifier, state.clock.now())
         self._check(caller)
         return caller
 

@@ -14,13 +14,15 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from core.clock import Clock
 from core.errors import BadRequest, Conflict, GardenError, TooLarge, Unauthorised, Unprocessable
-from core.mesh.auth import Verifier
+from core.mesh.auth import Caller, Verifier
 from core.mesh.direct import whole
 from core.mesh.problems import problem_response
 
 KEPT_ANSWERS = 256
 KEPT_FOR_S = 600.0
 _OPEN_PATHS = frozenset({"/healthz", "/readyz", "/introduction"})
+VOUCHED = "garden.caller"
+"""Where in an ASGI scope a request has its Caller that came under a seal, not with a token. Servers put nothing there."""
 _READS = frozenset({"GET", "HEAD", "OPTIONS"})
 _METHODS = _READS | {"POST", "PUT", "PATCH", "DELETE"}
 BROKEN = GardenError("something broke in here", hint="the log says what")
@@ -42,6 +44,11 @@ def bearer(headers: Headers) -> str:
     if scheme.lower() != "bearer" or not token.strip():
         raise Unauthorised("this needs a token", hint="send `Authorization: Bearer TOKEN`; `garden token` prints one")
     return token.strip()
+
+
+def caller_of(scope: Scope, verifier: Verifier, now_s: float) -> Caller:
+    """Who asks; raises Unauthorised."""
+    return scope.get(VOUCHED) or verifier.verify(bearer(scope["headers"]), now_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +142,7 @@ class Guard:
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers: list[tuple[bytes, bytes]] = scope["headers"]
-        self._check_enrolled(scope, headers)
+        self._check_enrolled(scope)
         receive = self._measured(headers, receive)
         key = header(headers, b"idempotency-key") if scope["method"] == "POST" else ""
         if key:
@@ -147,13 +154,20 @@ class Guard:
         direct = None if scope["query_string"] else self._direct.get((scope["method"], scope["path"]))
         await (direct or self._app)(scope, receive, send)
 
-    def _check_enrolled(self, scope: Scope, headers: Headers) -> None:
+    def _check_enrolled(self, scope: Scope) -> None:
         """Whoever wants a change shows a token before anything else is looked at; the route then asks for the role."""
         if self._verifier is None:
             return
         reads = scope["method"] in _READS
         if not reads or not (self._open_reads or scope["path"] in _OPEN_PATHS):
-            self._verifier.verify(bearer(headers), self._clock.now())
+            caller_of(scope, self._verifier, self._clock.now())
+
+    def _asker(self, scope: Scope) -> str:
+        """Whose keys are told apart: a node's by its name, whether it shows a token or a seal."""
+        if self._verifier is None:
+            return header(scope["headers"], b"authorization")
+        caller = caller_of(scope, self._verifier, self._clock.now())
+        return f"{caller.role} {caller.subject}"
 
     def _measured(self, headers: Headers, receive: Receive) -> Receive:
         """Refuse bodies that say they are too long, and end those that turn out to be."""
@@ -187,8 +201,7 @@ class Guard:
         if len(key) > 128:
             raise Unprocessable("the Idempotency-Key is longer than 128 characters")
         content = await whole(receive)
-        asker = header(scope["headers"], b"authorization")
-        full_key = "\0".join((asker, scope["path"], key))
+        full_key = "\0".join((self._asker(scope), scope["path"], key))
         request = hashlib.sha256(content).digest()
         if full_key in self._running:
             raise Conflict("the first request with this Idempotency-Key is still at work", hint="ask again in a moment")

@@ -12,9 +12,10 @@ from typing import Any, cast
 
 import jwt
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from pydantic import ValidationError
 
 from core.errors import Unauthorised
-from core.mesh.auth import Verifier
+from core.mesh.auth import Card, Verifier
 from core.mesh.peers import Peer, PeerKind
 from core.wire.documents import Document
 
@@ -41,22 +42,39 @@ class Introducer:
     key: Ed25519PrivateKey
 
     def introduce(self, nonce: str) -> Introduction:
-        claims = {"sub": self.id, "kind": self.kind, "url": self.url, "nonce": nonce, "card": self.card}
-        return Introduction(proof=jwt.encode(claims, self.key, algorithm="EdDSA"))
+        return Introduction(proof=self.sign({"nonce": nonce}))
+
+    def sign(self, claims: dict[str, Any]) -> str:
+        """A JWT under this node's own key that says who it is, and `claims`."""
+        me = {"sub": self.id, "kind": self.kind, "url": self.url, "card": self.card}
+        return jwt.encode(claims | me, self.key, algorithm="EdDSA")
 
 
 def met(proof: str, nonce: str, url: str, verifier: Verifier, now_s: float) -> Peer:
     """Who proved itself at `url` for the question `nonce`; raises Unauthorised when nobody of this garden did."""
-    card = verifier.card(_claims(proof).get("card"), now_s)
-    claims = _claims(proof, card.key)
+    card, claims = signed(proof, verifier, now_s)
     if claims.get("nonce") != nonce:
         raise Unauthorised("the proof answers another question")
     if claims.get("url") != url:
         raise Unauthorised(f"the node there says that it answers at {claims.get('url')!r}, not at {url!r}")
+    return signer(card, claims)
+
+
+def signed(proof: str, verifier: Verifier, now_s: float) -> tuple[Card, dict[str, Any]]:
+    """The card that a JWT under a node's own key carries, and all it says; raises Unauthorised."""
+    card = verifier.card(_claims(proof).get("card"), now_s)
+    return card, _claims(proof, card.key)
+
+
+def signer(card: Card, claims: dict[str, Any]) -> Peer:
+    """The node that signed; raises Unauthorised when it is not the one that the card names."""
     kind = claims.get("kind")
     if claims.get("sub") != card.subject or kind not in ROLE_OF or ROLE_OF[kind] != card.role:
         raise Unauthorised(f"{card.subject} is enrolled as a {card.role}, not as the {kind!r} it says it is")
-    return Peer(id=card.subject, kind=cast(PeerKind, kind), url=url)
+    try:
+        return Peer(id=card.subject, kind=cast(PeerKind, kind), url=claims.get("url", ""))
+    except ValidationError as error:
+        raise Unauthorised(f"{card.subject} says that it answers at {claims.get('url')!r}") from error
 
 
 def _claims(token: str, key: Any = None) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from core.wire.documents import Document, Identifier
 
 PeerKind = Literal["plant", "robot", "station", "sim", "console"]
 STATIC = "static list"
+FLOOD = "flood"
 
 
 class Peer(Document):
@@ -32,6 +33,13 @@ class Contact:
     seen_s: float | None = None
     """When it last proved who it is [garden s]; None for the static list, which is never asked to."""
     present: bool = True
+    way: tuple[str, ...] = ()
+    """Who passes requests on to it, itself the last (`core.mesh.relay`); empty: it is asked directly."""
+
+    @property
+    def in_reach(self) -> bool:
+        """Somebody listed, or met at its own address: it may be sent our token."""
+        return self.source != FLOOD
 
 
 class Peers:
@@ -57,10 +65,20 @@ class Peers:
         """Somebody has proved who it is; whether that is news. The static list's own word stands."""
         known = self._contacts.get(peer.id)
         if known is not None and known.seen_s is None:
-            known.hops = hops
+            known.hops, known.way = hops, ()
             return False
         news = known is None or not known.present or known.peer != peer
         self._contacts[peer.id] = Contact(peer, source, hops, now_s)
+        return news
+
+    def heard(self, peer: Peer, way: tuple[str, ...], now_s: float) -> bool:
+        """Somebody's sealed word came along a way of neighbours; whether that is news. Where it answers, others know."""
+        known = self._contacts.get(peer.id)
+        if known is not None and known.in_reach and known.present:
+            known.hops, known.way = len(way), way if len(way) > 1 else ()
+            return False
+        news = known is None or not known.present
+        self._contacts[peer.id] = Contact(peer, FLOOD, len(way), now_s, way=way)
         return news
 
     def lost(self, id: str) -> bool:
@@ -68,7 +86,7 @@ class Peers:
         known = self._contacts.get(id)
         if known is None or known.seen_s is None or not known.present:
             return False
-        known.present = False
+        known.present, known.way = False, ()
         return True
 
     def contacts(self) -> list[Contact]:
@@ -93,6 +111,9 @@ class Peers:
     def find(self, id: str) -> Peer | None:
         known = self._contacts.get(id)
         return None if known is None else known.peer
+
+    def contact(self, id: str) -> Contact | None:
+        return self._contacts.get(id)
 
     def one_hop(self) -> list[Peer]:
         """Neighbours in direct reach: everybody, on a static list."""

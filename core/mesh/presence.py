@@ -24,6 +24,8 @@ class SeenPeer(Document):
     """False: it was here, and does not answer any more."""
     seen_ago_s: float | None
     """Since it last proved who it is; null for the static list."""
+    way: list[Identifier] = []
+    """Who passes requests on to it, itself the last; empty: it is asked directly."""
 
 
 def add_presence(app: FastAPI, peers: Peers, clock: Clock, introducer: Introducer | None) -> None:
@@ -52,5 +54,5 @@ def _told(contact: Contact, now_s: float) -> SeenPeer:
     peer, seen_s = contact.peer, contact.seen_s
     return SeenPeer(
         id=peer.id, kind=peer.kind, url=peer.url, source=contact.source, hops=contact.hops, present=contact.present,
-        seen_ago_s=None if seen_s is None else max(0.0, now_s - seen_s),
+        seen_ago_s=None if seen_s is None else max(0.0, now_s - seen_s), way=list(contact.way),
     )  # fmt: skip
