@@ -28,7 +28,7 @@ from core.mesh.auth import Identity, Verifier, make_garden
 from core.mesh.client import HttpxTransport
 from core.mesh.node import Node
 from core.mesh.peers import Peers
-from core.mesh.runtime import GardenSettings, Runtime
+from core.mesh.runtime import GardenSettings, Runtime, joining, make_courier
 from core.scenario import Scenario, device_ports
 from hw.links import ByteLink, MemoryLink, MemoryNet
 from lab.mesh import MemoryMesh, MemoryTransport
@@ -212,19 +212,22 @@ class Garden:
             maker: Callable[..., Node] = build_robot if process.kind == "robot" else build_plant
             settings: Any = RobotSettings() if process.kind == "robot" else PlantSettings()
         assert common.keys is not None
+        identity, verifier = Identity.load(common.keys), Verifier.load(common.keys)
+        peers, transport = Peers(common.peers, common.hops_max), HttpxTransport(running.transport)
+        courier = make_courier(common, self.clock, identity, verifier, peers, transport)
         running.node = maker(
             settings,
             self.clock,
             self._opener(running),
-            running.transport,
+            courier or transport,
             Random(f"{self.seed}/{process.name}"),
-            identity=Identity.load(common.keys),
-            verifier=Verifier.load(common.keys),
-            peers=Peers(common.peers),
+            identity=identity,
+            verifier=verifier,
+            peers=peers,
             **({"cameras": running.transport} if process.kind == "robot" else {}),
         )
         self.mesh.attach(process.name, f"127.0.0.1:{process.port}", running.node.app)
-        return list(running.node.loops)
+        return [*running.node.loops, *joining(courier, identity, running.node)]
 
     def _build_body(self, running: Running, settings: BodySettings) -> list[Loop]:
         def accepting(name: str, accept: Callable[[ByteLink], None]) -> None:

@@ -27,6 +27,8 @@ NAP_S_MIN = 0.01
 STORAGE_NAP_S = 5.0
 KILL_TRIES = 3
 KILL_AGAIN_S = 1.0
+EVERY_ROBOT = "*robot"
+"""The address of a flood (`core.mesh.parcels`, which is loaded only where flooding is on)."""
 
 
 class Marketplace:
@@ -112,7 +114,7 @@ class Marketplace:
             self._keeper.machine.bid(task_id, ask.round_number, robot_id, bid, self._clock.now())
             self._wake.set()
 
-        await self._mesh.ask_all(peers, "POST", "/bids", ask.announcement, expect=Bid, each=answered)
+        await self._mesh.ask_all(peers, "POST", "/bids", ask.announcement, expect=Bid, each=answered, flood_to=EVERY_ROBOT)
 
     async def _grant(self, grant: Grant) -> None:
         award = grant.award

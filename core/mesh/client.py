@@ -38,6 +38,8 @@ D = TypeVar("D")
 T = TypeVar("T")
 ANSWER_BYTES_MAX = 4 * 1024 * 1024
 AT_ONCE_MAX = 256
+FLOOD_BYTES_MAX = 45_000
+"""A longer body does not fit into a parcel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,29 @@ class PeerTransport(Protocol):
     async def send(self, method: str, url: str, headers: Mapping[str, str], body: bytes) -> Answer: ...
 
     async def aclose(self) -> None: ...
+
+
+class Carrier(Protocol):
+    """A transport that also reaches peers beyond one hop, by neighbours that pass requests on (`core.mesh.courier`)."""
+
+    async def carry(
+        self, peer: Peer, method: str, path: str, headers: Mapping[str, str], body: bytes, within_s: float
+    ) -> Answer:
+        """An `OSError` means that nobody answered."""
+        ...
+
+    async def flood(
+        self,
+        to: str,
+        method: str,
+        path: str,
+        headers: Mapping[str, str],
+        body: bytes,
+        within_s: float,
+        heard: Callable[[Peer, Answer], None],
+    ) -> None:
+        """Ask all that `to` means, once each; returns when no more answers are awaited. Raises OSError."""
+        ...
 
 
 class HttpxTransport:
@@ -99,6 +124,7 @@ class Mesh:
         timeout_s: float = 2.0,
     ) -> None:
         self._transport = _transport(transport)
+        self._carrier = cast(Carrier, self._transport) if hasattr(self._transport, "carry") else None
         self._headers = {"authorization": f"Bearer {identity.token}"} if identity else {}
         self._clock = clock
         self._timeout_s = timeout_s
@@ -139,7 +165,10 @@ class Mesh:
         limit_s = self._timeout_s if timeout_s is None else timeout_s
         try:
             async with asyncio.timeout(limit_s):
-                answer = await self._transport.send(method, peer.url + path, sent, body)
+                if self._carrier is not None:
+                    answer = await self._carrier.carry(peer, method, path, sent, body, limit_s)
+                else:
+                    answer = await self._transport.send(method, peer.url + path, sent, body)
         except TimeoutError as error:
             self.outcomes[peer.id, "silent"] += 1
             raise PeerDown(f"{peer.id} did not answer {method} {path} within {limit_s:g} s") from error
@@ -159,12 +188,18 @@ class Mesh:
         expect: type[D],
         timeout_s: float | None = None,
         each: Callable[[str, D | GardenError], None] | None = None,
+        flood_to: str = "",
     ) -> dict[str, D | GardenError]:
         """Ask many at once, the body serialised once; every peer has its entry, an error in place of a missing answer.
 
-        `each` is called with every peer's answer as it comes in.
+        `each` is called with every peer's answer as it comes in. Where requests may be flooded, `flood_to` (an address of
+        `core.mesh.parcels`) lets one flood ask them all.
         """
         content = _dump(body)
+        if flood_to and self._carrier is not None and len(content) <= FLOOD_BYTES_MAX:
+            return await self._ask_by_flood(
+                self._carrier, flood_to, list(peers), method, path, content, expect, timeout_s, each
+            )
         answers: dict[str, D | GardenError] = {}
         gate = asyncio.Semaphore(AT_ONCE_MAX)
 
@@ -183,6 +218,37 @@ class Mesh:
             for peer in asked:
                 group.create_task(ask(peer))
         return {peer.id: answers[peer.id] for peer in asked}
+
+    async def _ask_by_flood(
+        self, carrier: Carrier, to: str, peers: list[Peer], method: str, path: str, content: bytes, expect: type[D],
+        timeout_s: float | None, each: Callable[[str, D | GardenError], None] | None,
+    ) -> dict[str, D | GardenError]:  # fmt: skip
+        limit_s = self._timeout_s if timeout_s is None else timeout_s
+        missing = {peer.id: peer for peer in peers}
+        answers: dict[str, D | GardenError] = {}
+
+        def ended(peer: Peer, answer: D | GardenError, how: str) -> None:
+            self.outcomes[peer.id, how] += 1
+            answers[peer.id] = answer
+            if each is not None:
+                each(peer.id, answer)
+
+        def heard(peer: Peer, answer: Answer) -> None:
+            if missing.pop(peer.id, None) is None:
+                return
+            try:
+                ended(peer, read(peer, answer, expect), "answered")
+            except GardenError as error:
+                ended(peer, error, "refused")
+
+        try:
+            async with asyncio.timeout(limit_s):
+                await carrier.flood(to, method, path, self._sent(content, ""), content, limit_s, heard)
+        except (OSError, TimeoutError):
+            pass
+        for peer in list(missing.values()):
+            ended(peer, PeerDown(f"{peer.id} did not answer {method} {path} within {limit_s:g} s"), "silent")
+        return {peer.id: answers[peer.id] for peer in peers}
 
     def _sent(self, body: bytes, key: str) -> dict[str, str]:
         headers = dict(self._headers)

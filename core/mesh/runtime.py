@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 from urllib.parse import urlsplit
 
 import structlog
@@ -20,8 +20,13 @@ from core.clock import Clock, WallClock, WorldClock
 from core.errors import ConfigError, GardenError
 from core.mesh.auth import Identity, Verifier
 from core.mesh.client import Mesh, PeerTransport
+from core.mesh.introduction import ROLE_OF
 from core.mesh.node import Loop, Node, serve
 from core.mesh.peers import Peer, Peers
+from core.mesh.presence import introducer
+
+if TYPE_CHECKING:
+    from core.mesh.courier import Courier
 
 FIRST_TIME_WITHIN_S = 90.0
 """The world may still be compiling itself."""
@@ -43,6 +48,8 @@ class GardenSettings(BaseSettings):
     """Where the service of every host listens that a routing table names."""
     hops_max: Annotated[int, Field(ge=1, le=255)] = 255
     """Robots and plants farther away are not asked."""
+    flood_hops: Annotated[int, Field(ge=0, le=16)] = 0
+    """Neighbours pass requests on, this far: for a radio without routing. 0: nobody does."""
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 0
     log: Literal["auto", "json", "text"] = "auto"
@@ -67,6 +74,8 @@ class Runtime:
     verifier: Verifier
     peers: Peers
     transport: PeerTransport
+    courier: Courier | None = None
+    """The transport, where requests are flooded."""
 
     def mesh(self, timeout_s: float = 2.0) -> Mesh:
         return Mesh(self.transport, self.identity, self.clock, timeout_s)
@@ -91,9 +100,33 @@ def make_runtime(settings: GardenSettings | None = None) -> Runtime:
     if settings.keys is None:
         raise ConfigError("GARDEN_KEYS names no key folder", hint="run `garden init`, then set GARDEN_KEYS=DATA/keys/NODE")
     identity, verifier = Identity.load(settings.keys), Verifier.load(settings.keys)
-    return Runtime(
-        settings, clock, clock_loops, identity, verifier, Peers(settings.peers, settings.hops_max), HttpTransport()
-    )
+    peers, transport = Peers(settings.peers, settings.hops_max), HttpTransport()
+    courier = make_courier(settings, clock, identity, verifier, peers, transport)
+    return Runtime(settings, clock, clock_loops, identity, verifier, peers, courier or transport, courier)
+
+
+def make_courier(
+    settings: GardenSettings, clock: Clock, identity: Identity, verifier: Verifier, peers: Peers, transport: PeerTransport
+) -> Courier | None:
+    """None where requests are not flooded: such a process does not even load what that takes."""
+    if not settings.flood_hops:
+        return None
+    from core.mesh.courier import Courier
+    from core.mesh.relay import Relay
+
+    relay = Relay(settings.flood_hops, peers, verifier, identity, transport, clock)
+    return Courier(relay, Random(f"{settings.seed}:{identity.subject}:courier"))
+
+
+def joining(courier: Courier | None, identity: Identity | None, node: Node) -> Sequence[Loop]:
+    """Make the node one that passes parcels on, and the loops for it; raises ConfigError."""
+    if courier is None:
+        return ()
+    me = introducer(identity, node.kind, node.url)
+    if me is None or node.kind not in ROLE_OF:
+        hint = "GARDEN_FLOOD_HOPS is for pots, stations and robots with keys and a URL of their own (PLANT_URL, ROBOT_URL)"
+        raise ConfigError(f"{node.id} cannot pass requests on", hint=hint)
+    return courier.join(me, node.app)
 
 
 def setup_logging(how: str = "auto") -> None:
@@ -151,7 +184,8 @@ async def _run(build: Builder, settings: GardenSettings) -> None:
             await _first_time(runtime.clock)
             node = await build(runtime)
             structlog.contextvars.bind_contextvars(node=node.id)
-            await serve(node, settings.host, settings.port, finding(runtime, node))
+            loops = (*finding(runtime, node), *joining(runtime.courier, runtime.identity, node))
+            await serve(node, settings.host, settings.port, loops)
             for task in clocks:
                 task.cancel()
     finally:

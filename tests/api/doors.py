@@ -34,6 +34,8 @@ LOOKED_AT = {
     "sim": ("/faults", "/clock"),
     "console": (),
 }
+FLOODING = {"GARDEN_FLOOD_HOPS": "3"}
+"""So that nodes have a door for it."""
 ENDLESS = {"/events", "/clock/feed", "/cameras/{robot}/hand.mjpg", "/camera.mjpg"}
 """They stream for ever: only asked for with something wrong."""
 
@@ -170,8 +172,9 @@ def open_doors(folder: Path) -> Iterator[Doors]:
     """A garden of two moist pots, a robot that stands near them and a station; all of it localised and at rest."""
     scenario = story.garden_of((), ("plant-1", "plant-2"), (story.near_robot(),))
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        pots = {plant.id: story.WATER_ONLY for plant in scenario.plants}
-        garden = runner.run(Garden(scenario, folder, settings=pots).__aenter__())
+        pots = {plant.id: story.WATER_ONLY | FLOODING for plant in scenario.plants}
+        nodes = {robot.id: FLOODING for robot in scenario.robots} | {scenario.station.id: FLOODING}
+        garden = runner.run(Garden(scenario, folder, settings=pots | nodes).__aenter__())
         try:
             runner.run(garden.clock.sleep(6.0))
             apps = {kind: _app(garden, name) for kind, name in KINDS.items() if kind != "console"}

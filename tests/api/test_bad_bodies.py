@@ -10,6 +10,10 @@ from typing import Any
 import pytest
 from doors import Doors, Operation, check_problem, open_doors
 
+from core.mesh.auth import Identity
+from core.mesh.parcels import EVERYBODY, sealed
+from core.mesh.presence import introducer
+
 POSE = {"x_m": 0.1, "y_m": 0.2, "yaw_rad": 0.3}
 CARD = {
     "plant_id": "plant-1",
@@ -48,8 +52,12 @@ REPORT = {
 TASK = {
     "kind": "water", "dose_ml": 40.0, "count": None, "fruit_ids": [], "order_id": "", "priority": 5, "within_s": 60.0,
 }  # fmt: skip
+PARCEL = {
+    "seal": "e30.e30.eA", "body": "", "via": ["robot-1"], "way": ["plant-2"], "hops_left": 1, "within_s": 1.0,
+}  # fmt: skip
 RESERVE = {"robot_id": "robot-1", "dock_id": "", "for_s": 3.0, "yielding": True}
 GOOD: dict[tuple[str, str, str], dict[str, Any]] = {
+    **{(kind, "POST", "/parcels"): PARCEL for kind in ("plant", "station", "robot")},
     ("plant", "PATCH", "/settings"): {
         "threshold_ratio": 0.2, "target_ratio": 0.24, "dose_ml": 100.0, "day_cap_ml": 900.0, "probe_every_s": 9.0,
         "soak_s": 5.0, "inventory_every_s": 9000.0, "uncertainty_max": 1.0, "inventory": False, "harvest": False,
@@ -160,7 +168,7 @@ def takers(doors: Doors) -> list[Operation]:
 def caller(doors: Doors, each: Operation) -> str:
     """A token that may use the operation, the best-placed to do harm with it."""
     assert each.roles
-    role = "robot" if each.roles == ("robot",) else "operator"
+    role = "operator" if "operator" in each.roles else "robot"
     return doors.token(role)
 
 
@@ -325,12 +333,25 @@ def test_what_makes_no_sense_here_is_refused(doors: Doors, kind: str, method: st
     assert doors.standing() == before
 
 
+def seal_of(doors: Doors) -> str:
+    """A seal under which the robot asks everybody for a sign of life."""
+    me = introducer(Identity.load(doors.garden.folder / "keys" / "robot-1"), "robot", doors.garden.url("robot-1"))
+    assert me is not None
+    now_s = doors.runner.run(_now(doors))
+    return sealed(me, "1", EVERYBODY, "GET", "/healthz", {}, b"", now_s)
+
+
+async def _now(doors: Doors) -> float:
+    return doors.garden.clock.now()
+
+
 def test_the_good_bodies_are_taken_and_change_something(tmp_path: Path) -> None:
     """So that it is the one wrong place for which the others were refused. In a garden of its own."""
     with open_doors(tmp_path) as doors:
         before = doors.standing()
         for each in takers(doors):
-            answer = doors.ask(each.kind, each.method, each.url(), token=caller(doors, each), json=GOOD[each.key])
+            good = GOOD[each.key] | ({"seal": seal_of(doors)} if each.path == "/parcels" else {})
+            answer = doors.ask(each.kind, each.method, each.url(), token=caller(doors, each), json=good)
             assert answer.status_code in (200, 201, 202, 204, 404, 409), (each.name, answer.text)
         after = doors.standing()
         changed = {name for name in after if after[name] != before[name]}

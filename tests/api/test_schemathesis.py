@@ -39,7 +39,7 @@ def try_one(doors: Doors, kind: str, operation: Any, mode: Any, examples: int) -
     """A robot asks in its own name, as anything else is answered 403 at once."""
     asked = 0
     roles = document_roles(operation)
-    token = doors.token("robot" if roles == ["robot"] else "operator")
+    token = doors.token("operator" if "operator" in (roles or ["operator"]) else "robot")
 
     @seed(SEED)
     @settings(

@@ -25,6 +25,7 @@ MAY: dict[tuple[str, str, str], set[str] | str] = {
     },
     **{("plant", "GET", path): ANYBODY for path in ("/ledger", "/ledger/{line_id}/{when}.jpg")},
     **{(kind, "GET", path): ANYBODY for kind in ("plant", "station", "robot") for path in ("/peers", "/introduction")},
+    **{(kind, "POST", "/parcels"): {"plant", "robot"} for kind in ("plant", "station", "robot")},
     ("plant", "PUT", "/ledger/{line_id}/{when}.jpg"): ROBOT,
     ("plant", "PATCH", "/settings"): OPERATOR,
     ("plant", "POST", "/inventory/fruits"): KEEPERS,
@@ -70,6 +71,7 @@ Reading is open while a port is published on loopback only; with `GARDEN_OPEN_RE
 `/readyz` and `/introduction` takes a token of any role.
 A plant and a robot act in their own name only: a plant offers and kills its own tasks, a robot reports on, asks permits
 for and reserves docks for itself.
+`POST /parcels` is there where `GARDEN_FLOOD_HOPS` is set; what is in a parcel meets this table in its author's role.
 `tests/api/test_who_may.py` holds this table against the running services, and names the command that writes it anew.
 """
 

@@ -14,7 +14,11 @@ from core.allocation.plant_side import Market
 from core.allocation.plant_state import Grant, Kill, Rules, Solicit
 from core.allocation.queue import TaskQueue
 from core.errors import GardenError
-from core.mesh.auth import ROLES, GardenKey
+from core.mesh import parcels
+from core.mesh.auth import ROLES, Enrolled, GardenKey, Identity, Verifier, make_garden
+from core.mesh.client import Answer
+from core.mesh.parcels import ANSWER_HEADERS, BODY_BYTES_MAX, LIFE_S, REQUEST_HEADERS, Parcel, opened, sealed, sealed_answer
+from core.mesh.presence import introducer
 from core.mesh.strict import parse
 from core.wire import documents, fruit, market, plant, robot
 from core.wire.geometry import Point3, Pose2
@@ -28,7 +32,7 @@ MODELS = {
     for model in (
         documents.NodeCard, documents.Problem, fruit.Pick, market.Announcement, market.Award, market.Bid, market.Permit,
         market.PermitRequest, market.Report, market.ReportAnswer, market.Reservation, market.ReservationRequest,
-        market.Task, plant.PlantState, robot.QueuedTask,
+        market.Task, parcels.Parcel, parcels.ParcelAnswer, parcels.ParcelAnswers, plant.PlantState, robot.QueuedTask,
     )
 }  # fmt: skip
 EXAMPLES = [(name, body) for kind, name, body in FENCED if kind == "json" and name in MODELS]
@@ -36,7 +40,7 @@ EXAMPLES = [(name, body) for kind, name, body in FENCED if kind == "json" and na
 
 def test_every_json_of_the_document_is_named_and_every_document_has_an_example() -> None:
     assert TEXT.count("```json") == len([kind for kind, _, _ in FENCED if kind == "json"])
-    assert {name for kind, name, _ in FENCED if kind == "json"} == MODELS.keys() | {"header", "claims"}
+    assert {name for kind, name, _ in FENCED if kind == "json"} == MODELS.keys() | {"header", "claims", "question", "reply"}
 
 
 @pytest.mark.parametrize(("name", "body"), EXAMPLES, ids=[f"{name}-{i}" for i, (name, _) in enumerate(EXAMPLES)])
@@ -70,6 +74,29 @@ def test_a_token_of_the_garden_is_as_the_document_says() -> None:
     assert re.fullmatch(r"garden-[0-9a-f]{16}", claims["aud"])
     assert re.fullmatch(r"garden-[0-9a-f]{16}", parts["claims"]["aud"])
     assert f"`role` is one of `{' '.join(ROLES)}`" in TEXT
+
+
+def test_the_seals_of_parcels_are_as_the_document_says(tmp_path: Path) -> None:
+    make_garden(tmp_path, [Enrolled("plant-1", "plant")], now_s=0.0)
+    me = introducer(Identity.load(tmp_path / "plant-1"), "plant", "http://10.77.0.1:8100")
+    assert me is not None
+    told = {name: json.loads(body) for kind, name, body in FENCED if name in ("question", "reply")}
+    import jwt
+
+    headers = {"content-type": "application/json"}
+    question = sealed(me, "1-1", "*robot", "POST", "/bids", headers, b"{}", 1.0)
+    taken = opened(Parcel(seal=question, body="e30=", via=["plant-1"], within_s=1.0), Verifier.load(tmp_path), 1.0, 0.0)
+    reply = sealed_answer(me, taken, Answer(200, b"{}", headers))
+    for name, seal in (("question", question), ("reply", reply)):
+        claims = jwt.decode(seal, options={"verify_signature": False})
+        assert claims.keys() == told[name].keys()
+        assert {key: claims[key] for key in ("aud", "headers", "sha256")} == {
+            key: told[name][key] for key in ("aud", "headers", "sha256")
+        }
+    section = TEXT.partition("## 8.")[2]
+    assert all(f"`{name}`" in section for name in (*REQUEST_HEADERS, *ANSWER_HEADERS))
+    assert f"at most {BODY_BYTES_MAX:,} bytes" in section
+    assert f"`iat` lies within {LIFE_S:g} s" in section
 
 
 def test_the_numbers_are_the_markets() -> None:
