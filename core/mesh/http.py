@@ -1,7 +1,10 @@
-"""The mesh's real transport: a small HTTP/1.1 client that keeps a connection or more to each peer.
+"""The mesh's real transport: a small HTTP/1.1 client that keeps a few connections to each peer.
 
 One request is one write and one future, which is what makes asking 200 robots at once cheap. Answers may have a length,
 be chunked (RFC 9112, section 7.1) or end with the connection; whatever is not HTTP is an OSError, as silence is.
+
+A request that its caller gave up still has its connection until the answer comes: a peer that has fallen behind is not
+asked on ever more connections, which would leave it further behind.
 """
 
 from __future__ import annotations
@@ -9,8 +12,9 @@ from __future__ import annotations
 import asyncio
 import re
 import ssl
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from urllib.parse import quote, urlsplit
 
 from core.errors import BadRequest
@@ -18,6 +22,10 @@ from core.mesh.client import ANSWER_BYTES_MAX, Answer
 
 KEPT_S = 25.0
 """Shorter than our servers keep an idle connection, so that no request meets one that is closing."""
+CONNECTIONS_MAX = 8
+"""To one peer; whoever comes when all are taken waits for one."""
+LATE_S = 10.0
+"""An answer that nobody waits for any more is given up after this."""
 HEAD_BYTES_MAX = 64 * 1024
 _SAFE = re.compile(r"[A-Za-z0-9/%:=&?~+!$,;'@()*._-]*")
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
@@ -35,55 +43,42 @@ class _Target:
 
 
 class HttpTransport:
-    """A PeerTransport over TCP. The caller holds the time-out; an abandoned request closes its connection."""
+    """A PeerTransport over TCP. The caller holds the time-out."""
 
     def __init__(self, tls: ssl.SSLContext | None = None) -> None:
         self._tls = tls
-        self._idle: dict[tuple[str, int, bool], list[_Connection]] = {}
+        self._hosts: dict[tuple[str, int, bool], _Host] = {}
         self._targets: dict[str, _Target] = {}
         self._open: set[_Connection] = set()
 
     async def send(self, method: str, url: str, headers: Mapping[str, str], body: bytes) -> Answer:
         target = self._target(url)
         data = _request(method, target, headers, body)
-        connection = self._kept(target.place)
-        if connection is not None:
+        if (host := self._hosts.get(target.place)) is None:
+            host = self._hosts[target.place] = _Host()
+        await host.enter()
+        if (connection := host.kept()) is not None:
             try:
-                return await self._exchange(connection, target.place, method, data)
+                return await connection.ask(data, method == "HEAD", host.left)
             except ConnectionResetError:
                 # It was closing while we wrote: a GET may simply be asked again, on a new connection.
                 if method != "GET":
                     raise
-        return await self._exchange(await self._connect(target.place), target.place, method, data)
+            await host.enter()
+        try:
+            connection = await self._connect(target.place)
+        except BaseException:
+            host.leave()
+            raise
+        return await connection.ask(data, method == "HEAD", host.left)
 
     async def aclose(self) -> None:
+        for host in self._hosts.values():
+            host.close()
         for connection in list(self._open):
             connection.close()
-        self._idle.clear()
+        self._hosts.clear()
         await asyncio.sleep(0)
-
-    async def _exchange(self, connection: _Connection, place: tuple[str, int, bool], method: str, data: bytes) -> Answer:
-        try:
-            answer = await connection.ask(data, method == "HEAD")
-        except BaseException:
-            connection.close()
-            raise
-        if connection.reusable:
-            self._idle.setdefault(place, []).append(connection)
-        else:
-            connection.close()
-        return answer
-
-    def _kept(self, place: tuple[str, int, bool]) -> _Connection | None:
-        """A connection that is open and not too old; the youngest first."""
-        idle = self._idle.get(place)
-        now_s = asyncio.get_running_loop().time()
-        while idle:
-            connection = idle.pop()
-            if connection.reusable and now_s - connection.used_s < KEPT_S:
-                return connection
-            connection.close()
-        return None
 
     async def _connect(self, place: tuple[str, int, bool]) -> _Connection:
         host, port, tls = place
@@ -126,6 +121,61 @@ def _request(method: str, target: _Target, headers: Mapping[str, str], body: byt
     return "".join(lines).encode("latin-1", "replace") + body
 
 
+@dataclass(slots=True)
+class _Host:
+    """The connections to one peer: those at rest, and how many are taken."""
+
+    taken: int = 0
+    idle: list[_Connection] = field(default_factory=list)
+    _waiting: deque[asyncio.Future[None]] = field(default_factory=deque)
+
+    async def enter(self) -> None:
+        """Wait for one's turn; first come, first served."""
+        if self.taken < CONNECTIONS_MAX:
+            self.taken += 1
+            return
+        turn = asyncio.get_running_loop().create_future()
+        self._waiting.append(turn)
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if not turn.cancelled():
+                self.leave()  # our turn came as we gave up
+            raise
+
+    def leave(self) -> None:
+        while self._waiting:
+            turn = self._waiting.popleft()
+            if not turn.done():
+                turn.set_result(None)
+                return
+        self.taken -= 1
+
+    def left(self, connection: _Connection) -> None:
+        """A request has ended, however."""
+        if connection.reusable:
+            self.idle.append(connection)
+        else:
+            connection.close()
+        self.leave()
+
+    def kept(self) -> _Connection | None:
+        """A connection that is open and not too old; the youngest first."""
+        now_s = asyncio.get_running_loop().time()
+        while self.idle:
+            connection = self.idle.pop()
+            if connection.reusable and now_s - connection.used_s < KEPT_S:
+                return connection
+            connection.close()
+        return None
+
+    def close(self) -> None:
+        while self._waiting:
+            turn = self._waiting.popleft()
+            if not turn.done():
+                turn.set_exception(ConnectionResetError("the transport was closed"))
+
+
 class _Connection(asyncio.Protocol):
     """One request at a time."""
 
@@ -133,6 +183,9 @@ class _Connection(asyncio.Protocol):
         self._open = open_
         self._transport: asyncio.Transport | None = None
         self._waiting: asyncio.Future[Answer] | None = None
+        self._left: Callable[[_Connection], None] | None = None
+        """Told once the request under way has ended; None between requests."""
+        self._given_up: asyncio.TimerHandle | None = None
         self._reader = _Reader(headless=False)
         self.used_s = 0.0
         self.reusable = False
@@ -142,51 +195,71 @@ class _Connection(asyncio.Protocol):
         self._transport = transport
         self._open.add(self)
 
-    async def ask(self, data: bytes, headless: bool) -> Answer:
+    async def ask(self, data: bytes, headless: bool, left: Callable[[_Connection], None]) -> Answer:
+        """`left` is called when the connection is free for others or gone, maybe after the caller has given up."""
         loop = asyncio.get_running_loop()
+        self._left, self.reusable = left, False
         if self._transport is None or self._transport.is_closing():
+            self._end()
             raise ConnectionResetError("the connection was closed")
-        self.reusable = False
         self._reader = _Reader(headless)
         self._waiting = loop.create_future()
         self._transport.write(data)
-        answer = await self._waiting
-        self.used_s = loop.time()
-        return answer
+        try:
+            return await self._waiting
+        except asyncio.CancelledError:
+            if self._left is not None:
+                self._given_up = loop.call_later(LATE_S, self.close)
+            raise
 
     def data_received(self, data: bytes) -> None:
-        waiting = self._waiting
-        if waiting is None or waiting.done():
+        if self._left is None:
             self.close()  # bytes that nobody asked for
             return
         try:
             answer = self._reader.feed(data)
         except ValueError as error:
-            waiting.set_exception(ConnectionError(f"the answer is not HTTP: {error}"))
+            self._fail(ConnectionError(f"the answer is not HTTP: {error}"))
             self.close()
             return
         if answer is not None:
-            self.reusable = self._reader.keep
-            waiting.set_result(answer)
+            self._answered(answer)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self.reusable = False
         self._open.discard(self)
-        waiting = self._waiting
-        if waiting is None or waiting.done():
-            return
-        answer = self._reader.at_end()
-        if answer is not None:
-            waiting.set_result(answer)
+        self._reader.keep = False
+        if (answer := self._reader.at_end()) is not None:
+            self._answered(answer)
         elif self._reader.begun:
-            waiting.set_exception(ConnectionError("the answer broke off"))
+            self._fail(ConnectionError("the answer broke off"))
         else:
-            waiting.set_exception(ConnectionResetError(str(exc or "the connection was closed without an answer")))
+            self._fail(ConnectionResetError(str(exc or "the connection was closed without an answer")))
+        self.reusable = False
+        self._end()
 
     def close(self) -> None:
         self.reusable = False
         if self._transport is not None:
             self._transport.abort()
+        self._end()
+
+    def _answered(self, answer: Answer) -> None:
+        if self._waiting is not None and not self._waiting.done():
+            self._waiting.set_result(answer)
+        self.reusable, self.used_s = self._reader.keep, asyncio.get_running_loop().time()
+        self._end()
+
+    def _fail(self, error: ConnectionError) -> None:
+        if self._waiting is not None and not self._waiting.done():
+            self._waiting.set_exception(error)
+
+    def _end(self) -> None:
+        if self._given_up is not None:
+            self._given_up.cancel()
+            self._given_up = None
+        if self._left is not None:
+            left, self._left = self._left, None
+            left(self)
 
 
 class _Reader:

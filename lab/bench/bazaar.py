@@ -24,7 +24,7 @@ from core.allocation.bidding import DOCKING_S, UNDOCKING_S, Condition, Stop, ins
 from core.allocation.queue import Entry, TaskQueue
 from core.allocation.reorder import better_order
 from core.clock import Clock, WorldClock
-from core.errors import GardenError, Overtaken
+from core.errors import GardenError, Overtaken, PeerDown
 from core.mesh.auth import Caller, GardenKey
 from core.mesh.chassis import allow, body, create_app
 from core.mesh.client import Mesh
@@ -49,6 +49,7 @@ from robot_service.brain import OVERTAKEN_FOR_S, queued
 
 KEY = GardenKey.from_seed(9)
 REPORT_EVERY_S = 2.0
+AGAIN_S = 1.0
 FOR_EVER_S = 1e9
 WET_RATIO = 0.3
 
@@ -159,12 +160,22 @@ class Hawker:
         self.here, self.docked = self.places[entry.plant_id], entry.plant_id
         await self.clock.sleep(work_s(KIND, 0.0))
         scan = Scan(scan_id=f"{self.id}:{entry.task_id}:{entry.epoch}", task_id=entry.task_id, robot_id=self.id)
-        self.counts["scans"] += 1
-        await self.mesh.call(self.peers.get(entry.plant_id), "POST", "/inventory/scans", scan, expect=Inventory)
+        while not await self._scanned(entry, scan):
+            await self.clock.sleep(AGAIN_S)
         self.served.append(entry.task_id)
         while not await self._report(entry, "done"):
-            await self.clock.sleep(1.0)
+            await self.clock.sleep(AGAIN_S)
         self.queue.drop(entry)
+
+    async def _scanned(self, entry: Entry, scan: Scan) -> bool:
+        """Whether the plant has it, or wants it no longer."""
+        self.counts["scans"] += 1
+        try:
+            await self.mesh.call(self.peers.get(entry.plant_id), "POST", "/inventory/scans", scan, expect=Inventory)
+        except PeerDown:
+            self.counts["unheard"] += 1
+            return False
+        return True
 
     async def report(self) -> None:
         """Renew the leases of all it holds, for ever."""

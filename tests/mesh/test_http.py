@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from core.errors import BadRequest
+from core.mesh import http
 from core.mesh.client import Answer
-from core.mesh.http import HttpTransport, _Reader
+from core.mesh.http import CONNECTIONS_MAX, HttpTransport, _Reader
 
 T = TypeVar("T")
 Story = Callable[[str, HttpTransport], Awaitable[T]]
@@ -49,7 +50,12 @@ class Script:
 
 def against(script: Script, story: Story[T]) -> T:
     async def go() -> T:
-        server = await asyncio.start_server(script.serve, "127.0.0.1", 0)
+        serving: list[asyncio.Task[None]] = []
+
+        def accepted(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            serving.append(asyncio.create_task(script.serve(reader, writer)))
+
+        server = await asyncio.start_server(accepted, "127.0.0.1", 0)
         transport = HttpTransport()
         try:
             async with asyncio.timeout(5):
@@ -57,6 +63,7 @@ def against(script: Script, story: Story[T]) -> T:
         finally:
             await transport.aclose()
             server.close()
+            await asyncio.gather(*serving)
             await server.wait_closed()
 
     return asyncio.run(go())
@@ -143,17 +150,97 @@ def test_a_kept_connection_that_was_closed_costs_a_get_nothing_but_a_post_is_tol
         against(Script(SIZED, None, SIZED), lambda url, t: twice("POST", url, t))
 
 
-def test_an_abandoned_request_closes_its_connection() -> None:
+async def gives_up(url: str, transport: HttpTransport, after_s: float = 0.1) -> None:
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(after_s):
+            await transport.send("GET", url, {}, b"")
+
+
+def test_no_other_request_gets_the_answer_to_one_that_was_given_up() -> None:
     script = Script(b"HTTP/1.1 200 OK\r\ncontent-length: 50\r\n\r\nhello", SIZED)
 
     async def story(url: str, transport: HttpTransport) -> Answer:
-        with pytest.raises(TimeoutError):
-            async with asyncio.timeout(0.1):
-                await transport.send("GET", url, {}, b"")
+        await gives_up(url, transport)
         return await transport.send("GET", url, {}, b"")
 
     assert against(script, story).body == b"hello"
     assert script.connections == 2
+
+
+class Slow(Script):
+    """Answers only once it is let."""
+
+    def __init__(self, *says: bytes | None) -> None:
+        super().__init__(*says)
+        self.may = asyncio.Event()
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.connections += 1
+        heard = asyncio.create_task(reader.readuntil(b"\r\n\r\n"))
+        while await _comes(heard):
+            heard = asyncio.create_task(reader.readuntil(b"\r\n\r\n"))
+            may = asyncio.create_task(self.may.wait())
+            await asyncio.wait({may, heard}, return_when=asyncio.FIRST_COMPLETED)
+            if not may.done():
+                may.cancel()
+                continue
+            writer.write(self._says.pop(0) or b"")
+        writer.close()
+
+
+async def _comes(request: asyncio.Task[bytes]) -> bool:
+    try:
+        await request
+    except (asyncio.IncompleteReadError, ConnectionError):
+        return False
+    return True
+
+
+def test_a_peer_that_has_fallen_behind_is_not_asked_on_ever_more_connections() -> None:
+    script = Slow(*[SIZED] * (CONNECTIONS_MAX + 1))
+
+    async def story(url: str, transport: HttpTransport) -> bytes:
+        await asyncio.gather(*(gives_up(url, transport) for _ in range(3 * CONNECTIONS_MAX)))
+        script.may.set()
+        return (await transport.send("GET", url, {}, b"")).body
+
+    assert against(script, story) == b"hello"
+    assert script.connections == CONNECTIONS_MAX
+
+
+def test_requests_beyond_the_connections_wait_for_their_turn() -> None:
+    script = Slow(*[SIZED] * 3 * CONNECTIONS_MAX)
+    script.may.set()
+
+    async def story(url: str, transport: HttpTransport) -> list[Answer]:
+        return await asyncio.gather(*(transport.send("GET", url, {}, b"") for _ in range(3 * CONNECTIONS_MAX)))
+
+    assert [answer.body for answer in against(script, story)] == [b"hello"] * 3 * CONNECTIONS_MAX
+    assert script.connections == CONNECTIONS_MAX
+
+
+def test_an_answer_that_never_comes_costs_no_connection_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "LATE_S", 0.05)
+    script = Slow(*[SIZED] * 2 * CONNECTIONS_MAX)
+
+    async def story(url: str, transport: HttpTransport) -> None:
+        for _ in range(2):
+            await asyncio.gather(*(gives_up(url, transport) for _ in range(CONNECTIONS_MAX)))
+
+    against(script, story)
+    assert script.connections == 2 * CONNECTIONS_MAX
+
+
+def test_who_waits_for_a_connection_is_told_when_the_transport_closes() -> None:
+    async def story(url: str, transport: HttpTransport) -> list[Answer | BaseException]:
+        asked = [asyncio.create_task(transport.send("GET", url, {}, b"")) for _ in range(CONNECTIONS_MAX + 1)]
+        await asyncio.sleep(0.1)
+        await transport.aclose()
+        return await asyncio.gather(*asked, return_exceptions=True)
+
+    ends = against(Slow(SIZED), story)
+    assert len(ends) == CONNECTIONS_MAX + 1
+    assert all(isinstance(end, ConnectionResetError) for end in ends)
 
 
 def test_nothing_can_be_smuggled_into_a_request() -> None:
