@@ -106,6 +106,11 @@ def test_nothing_is_written_before_anything_changed() -> None:
     assert not docks.document().loans[0].yielding
 
 
+def test_a_look_at_a_free_dock_changes_nothing() -> None:
+    docks = station()
+    assert (docks.loan("tap", 5.0).robot_id, docks.dirty) == ("", False)
+
+
 def test_who_is_served_no_longer_waits() -> None:
     docks = station()
     held = ask(docks, "a", 0.0, yielding=True)

@@ -814,6 +814,52 @@ def test_a_restart_puts_a_pick_in_doubt_whose_task_has_ended_and_keeps_that_of_a
     assert Plant(free, 5.0).market.doubts == ["f1"]
 
 
+def test_each_pick_that_is_told_begins_the_quarter_of_an_hour_anew() -> None:
+    plant = harvesting()
+    for now_s in range(1, 1400, 6):
+        plant.now_s = float(now_s)
+        plant.report(T, "running", picks=[picked("f2", "failed", reason="slipped")] if now_s > 500 else [])
+        plant.carried_out()
+    assert plant.task(T).state == "running"
+    plant.at(1404.9)
+    assert plant.task(T).state == "running"
+    plant.at(1405.0)
+    assert plant.task(T).reason == "robot-1 kept it 900 s without acting"
+
+
+def test_a_pick_that_is_told_before_anything_runs_begins_no_quarter_of_an_hour() -> None:
+    plant = harvesting()
+    plant.report(T, "awarded", picks=[picked("f2", "failed", reason="slipped")])
+    for now_s in range(1, 1200, 6):
+        plant.now_s = float(now_s)
+        assert plant.report(T, "awarded")
+        plant.carried_out()
+    plant.at(1200.0)
+    assert plant.task(T).state == "awarded"
+
+
+def test_an_open_pick_holds_up_no_other_task() -> None:
+    plant = harvesting()
+    plant.wet()
+    plant.permit(T, "pick", fruit_id="f1")
+    water = plant.ask()
+    plant.at(0.5)
+    plant.now_s = 1.0
+    plant.report(T, "running")
+    assert plant.market.due_s() == 1.5, "its award is sent again"
+    assert [grant.award.announcement.task_id for grant in of(Grant, plant.next())] == [water]
+
+
+def test_a_dose_whose_task_is_long_forgotten_is_settled_all_the_same() -> None:
+    plant = awarded()
+    plant.permit(T)
+    forgotten = Plant(plant.market.document().model_copy(update={"tasks": []}), 100.0).wet()
+    forgotten.market.soil(0.3, "", 160.0)
+    assert not forgotten.market.permit_open
+    (note,) = [note for note in of(Note, forgotten.market.take_effects()) if note.kind == "measured"]
+    assert (note.task_id, note.robot_id, note.data) == (T, "robot-1", {"rise_ratio": pytest.approx(0.15)})
+
+
 # Scans
 
 
