@@ -50,6 +50,8 @@ class Part:
     tests: tuple[str, ...]
     sample: int | None = None
     """So many mutants a run, drawn by the seed; None: all."""
+    without: str = ""
+    """Tests whose name holds this are left out."""
 
 
 @dataclass(slots=True)
@@ -77,6 +79,7 @@ class Trial:
     def __init__(self, root: Path, part: Part) -> None:
         """Raises TestsFailError."""
         self._root, self._part = root, part
+        self.sources = {file: (root / file).read_bytes() for file in part.files}
         self._temporary = tempfile.TemporaryDirectory()
         self._told = Path(self._temporary.name) / "told.json"
         os.environ["HYPOTHESIS_STORAGE_DIRECTORY"] = f"{self._temporary.name}/hypothesis"
@@ -98,7 +101,7 @@ class Trial:
         tests = self.watched.tests_of(file, mutant, _users(self._root, self._part.files, file))
         if not tests:
             return "unreached"
-        source = mutant.put_into((self._root / file).read_bytes())
+        source = mutant.put_into(self.sources[file])
         limit_s = sum(self._allowed_s(test) for test in tests)
         code = self._in_child(lambda: self._run(tests, _Altered(self._root / file, _module(file), source)), limit_s)
         if code == -signal.SIGALRM:
@@ -141,7 +144,8 @@ class Trial:
 
     def _watch(self) -> int:
         watcher = _Watcher(self._root, self._part.files)
-        code = self._pytest(self._part.tests, watcher)
+        named = ("-k", f"not {self._part.without}") if self._part.without else ()
+        code = self._pytest((*self._part.tests, *named), watcher)
         names = [name for name, module in list(sys.modules.items()) if self._is_foreign(module)]
         lines = {test: {file: sorted(seen) for file, seen in files.items()} for test, files in watcher.lines.items()}
         self._told.write_text(json.dumps({"took_s": watcher.took_s, "lines": lines, "modules": names}))
