@@ -92,6 +92,54 @@ def test_no_promise_is_broken_in_any_queue():
     assert late > 100
 
 
+def test_done_at_the_very_deadline_is_in_time():
+    alone_s = done_s(price(NEAR, ME).breakdown)
+    assert offer(due(NEAR, alone_s), ME) == price(NEAR, ME)
+    assert offer(due(NEAR, alone_s - 1e-6), ME).cost_s is None
+    busy = replace(ME, queue=(stop(FAR),))
+    far_s = done_s(price(FAR, ME).breakdown)
+    both_s = done_s(price(FAR, replace(ME, queue=(stop(NEAR, settled=True),))).breakdown)
+    assert place(NEAR, busy, [due(FAR, both_s)]) == 0, "both are in time, one of them just so"
+    assert place(NEAR, busy, [due(FAR, both_s - 1e-6)]) == 1
+    assert place(NEAR, busy, [due(FAR, far_s)]) == 1
+    assert place(NEAR, busy, [due(FAR, far_s - 1e-6)]) == 0
+
+
+def test_what_is_promised_before_a_task_is_no_concern_of_it():
+    """Only what stands behind the place could come later for it."""
+    first = stop(NEAR, settled=True)
+    busy = replace(ME, queue=(first, stop(FAR)))
+    spare = asked("spare", task_id="spare:1")
+    assert place(spare, busy, [due(NEAR, 60.0)]) == place(spare, busy)
+
+
+def test_what_is_not_urgent_goes_behind_all_promises_and_keeps_their_order():
+    tap = asked("tap", task_id="tap:1")
+    busy = replace(ME, queue=(stop(NEAR), stop(FAR)))
+    at_s = [done_s(price(task, replace(ME, queue=busy.queue[:i])).breakdown) for i, task in enumerate((NEAR, FAR))]
+    promised = [due(NEAR, at_s[0] + 100.0), due(FAR, at_s[1] + 1.0)]
+    assert place(tap, busy) == 1, "on the way it adds least"
+    assert place(tap, busy, promised) == 2
+    assert place(tap, busy, promised[:1]) == 1, "that one is not behind it"
+
+
+def test_a_task_with_a_deadline_hurries_only_past_its_equals():
+    tap = asked("tap", task_id="tap:1")
+    soon = due(tap, done_s(price(tap, ME).breakdown) + 1.0)
+    for priority, fits in ((4, True), (5, True), (6, False)):
+        busy = replace(ME, queue=(stop(NEAR, priority=priority),))
+        assert (offer(soon, busy).cost_s is not None) == fits
+        if fits:
+            assert place(soon, busy) == 0
+
+
+def test_what_cannot_be_done_says_why_and_not_when():
+    nowhere = due(asked("nowhere", task_id="n:1"), 60.0)
+    assert offer(nowhere, ME) == price(nowhere, ME)
+    assert "no way" in offer(nowhere, ME).reason
+    assert offer(due(NEAR, 60.0), replace(ME, can=frozenset())).reason == "no pump"
+
+
 def test_a_robot_reckons_with_the_time_that_is_left_of_what_it_promised():
     async def story(garden):
         brain = garden.brains["robot-1"]
