@@ -46,6 +46,14 @@ def test_docks_that_nobody_reaches_count_as_far_and_ties_go_by_name() -> None:
     assert better_place(ways(0.0), [], {}) is None
 
 
+def test_a_fifth_less_is_not_enough_and_a_dock_beyond_far_counts_as_far() -> None:
+    assert (GAIN_RATIO, FAR_S) == (0.2, 600.0)
+    assert better_place({"a": 10.0}, [], {"b": {"a": 8.0}}) is None
+    assert better_place({"a": 10.0}, [], {"b": {"a": 7.99}}) == "b"
+    assert reach_s([{"a": 9000.0, "b": 1.0}], ["a", "b"]) == 601.0
+    assert reach_s([{"a": 599.0}], ["a"]) == 599.0
+
+
 def test_in_any_garden_moving_one_after_the_other_ends_and_comes_near_the_best() -> None:
     seed = 3
     print(f"seed {seed}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from typing import Any
+from zlib import crc32
 
 import pytest
 
@@ -144,6 +145,37 @@ def test_a_watering_from_the_question_to_the_measured_rise() -> None:
     assert [(note.kind, note.what) for note in notes if note.data] == [("measured", "soil went from 0.150 to 0.158")]
     assert notes[-1] == Note("done", "done: soil went from 0.150 to 0.158", T, "robot-1")
     assert plant.market.due_s() == math.inf
+
+
+def test_the_day_s_doses_are_written_down_with_the_time_of_the_clock_they_are_told_by() -> None:
+    plant = awarded()
+    assert plant.market.document().doses_at_s == 0.0
+    plant.now_s = 4.0
+    plant.permit(T)
+    document = plant.market.document()
+    assert (document.doses_at_s, [(dose.t_s, dose.ml) for dose in document.doses]) == (4.0, [(4.0 + 15.0 + 35.0, 150.0)])
+    plant.market.soil(0.15, "", 7.0)
+    assert plant.market.document().doses_at_s == 7.0
+    again = Plant(plant.market.document(), 1000.0)
+    assert [(dose.t_s, dose.ml) for dose in again.market.document().doses] == [(1047.0, 150.0)]
+    assert again.market.document().doses_at_s == 1000.0
+    assert (again.market.left_ml(1000.0), again.market.left_ml(1047.0 + 86400.0)) == (1350.0, 1500.0)
+    again.market.limits.day_cap_ml = 100.0
+    assert again.market.left_ml(1000.0) == 0.0
+
+
+def test_with_thirty_millilitres_left_a_dose_is_given_and_with_less_none() -> None:
+    for cap_ml, left in ((30.0, True), (29.9, False)):
+        plant = Plant().wet()
+        plant.market.limits.day_cap_ml = cap_ml
+        if left:
+            plant.ask()
+        else:
+            with pytest.raises(Refused, match="the day's 30 ml are given"):
+                plant.ask()
+    silent = Plant()
+    with pytest.raises(Refused, match="the soil probe is not measured yet: a dose could not be verified"):
+        silent.ask()
 
 
 def test_nobody_can_is_asked_less_and_less_often_and_written_down_once() -> None:
@@ -609,6 +641,45 @@ def test_a_late_or_foreign_answer_changes_nothing() -> None:
     assert plant.task(T).robot_id == "robot-2"
     plant.market.bid(T, 1, "robot-1", Bid(task_id=T, robot_id="robot-1", cost_s=1.0), 2.1)
     assert plant.task(T).robot_id == "robot-2"
+
+
+def test_each_decline_in_a_row_waits_twice_as_long_each_task_at_a_moment_of_its_own() -> None:
+    plant = Plant(a=10.0, b=30.0).wet()
+    plant.ask()
+    for declines in range(6):
+        plant.next()
+        assert of(Grant, plant.effects)[-1].award.at_most_s == 30.0
+        plant.market.award_answered(T, declines + 1, "90 s by now", plant.now_s, overtaken=True)
+        spread = 0.5 + crc32(f"{T} {declines + 1}".encode()) / 2**32
+        assert plant.market.due_s() - plant.now_s == pytest.approx(spread * 0.05 * 2**declines)
+        assert plant.task(T).reason == "a declined the award: 90 s by now"
+    plant.next()
+    assert of(Grant, plant.effects)[-1].award.at_most_s is None, "now it takes it at any price"
+
+
+def test_a_task_that_moved_for_a_price_and_was_declined_does_not_move_for_a_price_again() -> None:
+    plant = awarded(a=10.0, b=30.0)
+    plant.now_s = 5.0
+    plant.report(T, "awarded", "a")
+    plant.costs_s["b"] = 5.0
+    plant.next()
+    plant.market.award_answered(T, 2, "busy", plant.now_s, overtaken=True)
+    plant.next()
+    assert plant.task(T).robot_id == "b"
+    plant.market.award_answered(T, 3, "", plant.now_s)
+    plant.now_s += 5.0
+    plant.report(T, "awarded", "b", 3)
+    plant.costs_s["a"] = 0.5
+    plant.next()
+    assert (len(plant.task(T).rounds), plant.task(T).robot_id) == (3, "b")
+
+
+def test_the_most_urgent_is_asked_for_first() -> None:
+    plant = Plant(**{"robot-1": None})
+    plant.market.fruits([fruit(f"f{number}") for number in range(3)], 0.0)
+    for number, priority in enumerate((3, 9, 5)):
+        plant.ask("harvest", 0.0, fruit_ids=[f"f{number}"], count=1, priority=priority)
+    assert [asked.announcement.priority for asked in of(Solicit, plant.at(0.0))] == [9, 5, 3]
 
 
 # Fruit
