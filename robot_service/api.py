@@ -45,10 +45,12 @@ def make_app(brain: Brain, verifier: Verifier | None, open_reads: bool = True) -
 
 
 def _market(app: FastAPI, brain: Brain) -> None:
-    @app.post("/bids", summary="Announcement in, bid out", tags=["market"])
-    async def bid(caller: Caller = allow("plant", "operator"), asked: Announcement = body(Announcement)) -> Bid:
+    @app.post("/bids", summary="Announcement in, bid out", tags=["market"], response_model=Bid)
+    async def bid(caller: Caller = allow("plant", "operator"), asked: Announcement = body(Announcement)) -> Response:
         check_owner(asked, caller)
-        return await brain.bid(asked)
+        return Response((await brain.bid(asked)).model_dump_json(), media_type="application/json")
+
+    serve_direct(app, "POST", "/bids")
 
     @app.get("/tasks", summary="The queue", tags=["market"])
     async def tasks() -> list[QueuedTask]:

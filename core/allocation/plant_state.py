@@ -142,6 +142,8 @@ class Live:
     """How often that happened in a row."""
     moves: int = 0
     """How often it went to a better price since it was last announced."""
+    silences: int = 0
+    """How many re-allocation rounds in a row its holder did not answer."""
     silent: bool = False
     """The lease ended while a permit was open."""
     told: str = ""

@@ -11,11 +11,14 @@ from collections.abc import Sequence
 from typing import Any, Literal
 from zlib import crc32
 
-from core.allocation.auction import Round, better_than_holder, cheapest, told, worth_s
+from core.allocation.auction import SILENT, Round, better_than_holder, cheapest, told, worth_s
 from core.allocation.epochs import Names, owner_of
 from core.allocation.plant_state import Effect, Grant, Kill, Live, MarketDocument, Note, Rules, Solicit
 from core.errors import NotFound
 from core.wire.market import FINAL_STATES, Announcement, Award, Bid, BidRound, PlantCard, Task, TaskEvent
+
+SILENCES_MAX = 3
+"""A holder that does not answer is asked again after twice as long each time, up to 2 ** this."""
 
 
 class TaskBook:
@@ -220,10 +223,16 @@ class TaskBook:
     def _close_reallocation(self, task: Task, bids: list[Bid], now_s: float) -> None:
         if task.state != "awarded":
             return
+        live, own = self._live[task.task_id], next((bid for bid in bids if bid.robot_id == task.robot_id), None)
+        if own is None or own.reason == SILENT:
+            # Its lease decides. It is gone, or so far behind that more questions would leave it further behind.
+            live.silences = min(live.silences + 1, SILENCES_MAX)
+            live.reallocate_s = now_s + self.rules.reallocate_s * 2**live.silences
+            return
+        live.silences = 0
         best = better_than_holder(bids, task.robot_id, self.rules.margin_ratio)
         if best is None:
             return
-        own, live = next(bid for bid in bids if bid.robot_id == task.robot_id), self._live[task.task_id]
         if own.cost_s is not None and live.moves >= self.rules.moves_max:
             return
         live.moves += 1

@@ -20,13 +20,15 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+from starlette.responses import Response
+
 from core.allocation.bidding import DOCKING_S, UNDOCKING_S, Condition, Stop, insertion, offer, work_s
 from core.allocation.queue import Entry, TaskQueue
 from core.allocation.reorder import better_order
 from core.clock import Clock, WorldClock
 from core.errors import GardenError, Overtaken, PeerDown
 from core.mesh.auth import Caller, GardenKey
-from core.mesh.chassis import allow, body, create_app
+from core.mesh.chassis import allow, body, create_app, serve_direct
 from core.mesh.client import Mesh
 from core.mesh.events import EventLog
 from core.mesh.http import HttpTransport
@@ -208,10 +210,12 @@ def robot(plan: Plan, id: str, clock: Clock) -> tuple[Node, Hawker]:
         events=EventLog(clock), open_reads=True,
     )  # fmt: skip
 
-    @app.post("/bids")
-    async def bid(caller: Caller = allow("plant"), asked: Announcement = body(Announcement)) -> Bid:
+    @app.post("/bids", response_model=Bid)
+    async def bid(caller: Caller = allow("plant"), asked: Announcement = body(Announcement)) -> Response:
         hawker.counts["bids"] += 1
-        return offer(asked, hawker.condition())[0]
+        return Response(offer(asked, hawker.condition())[0].model_dump_json(), media_type="application/json")
+
+    serve_direct(app, "POST", "/bids")
 
     @app.post("/tasks", status_code=201)
     async def award(caller: Caller = allow("plant"), award: Award = body(Award)) -> QueuedTask:

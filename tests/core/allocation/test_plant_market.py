@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 from dataclasses import dataclass, field
@@ -218,6 +219,36 @@ def test_prices_that_sway_move_a_task_once_and_a_holder_that_cannot_always_loses
     assert asked_again(11.0, 9.0, 4.0) == "robot-2"
     assert asked_again(22.0, 1.0, 9.0) == "robot-2"
     assert asked_again(33.0, 1.0, None) == "robot-1"
+
+
+def test_a_holder_that_does_not_answer_is_asked_ever_more_seldom_until_it_does() -> None:
+    made = market()
+    task_id, asked_s, now_s = awarded(made), [0.0], 0.0
+    made.award_answered(task_id, 1, "", 0.0)
+    while len(asked_s) < 7:
+        made.take_effects()
+        report(made, task_id, "awarded", now_s)
+        made.tick(now_s, ROBOTS[:2])
+        if asks := [e for e in made.take_effects() if isinstance(e, Solicit)]:
+            asked_s.append(now_s)
+            for robot_id in ROBOTS[0 if len(asked_s) == 6 else 1 : 2]:
+                made.bid(task_id, asks[0].round_number, robot_id, bid(robot_id, 5.0, task_id), now_s)
+        now_s += 1.0
+    waits_s = [after - before for before, after in itertools.pairwise(asked_s)]
+    window_s, again_s = made.rules.bid_window_s, made.rules.reallocate_s
+    assert waits_s == [again_s, *(window_s + again_s * times for times in (2, 4, 8, 8)), again_s]
+    assert made.task(task_id).robot_id == "robot-1"
+
+
+def test_a_holder_that_is_known_no_more_is_left_to_its_lease() -> None:
+    made = market()
+    task_id = awarded(made)
+    report(made, task_id, "awarded", 10.0)
+    made.tick(10.0, ROBOTS[1:])
+    (ask,) = [e for e in made.take_effects() if isinstance(e, Solicit)]
+    for robot_id in ROBOTS[1:]:
+        made.bid(task_id, ask.round_number, robot_id, bid(robot_id, 1.0, task_id), 10.0)
+    assert made.task(task_id).robot_id == "robot-1"
 
 
 def test_an_unacknowledged_award_is_sent_again_until_the_lease_ends() -> None:
