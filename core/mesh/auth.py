@@ -13,7 +13,7 @@ import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jwt
 from cryptography.exceptions import UnsupportedAlgorithm
@@ -22,6 +22,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from core.errors import ConfigError, Unauthorised
 
+V = TypeVar("V")
 ROLES = ("plant", "robot", "operator", "viewer")
 TOKEN_LIFE_S = 365 * 86400.0
 _CACHE_MAX = 1024
@@ -152,6 +153,7 @@ class Verifier:
         self._garden = garden
         self._audience = audience(garden)
         self._known: dict[str, tuple[Caller, float]] = {}
+        self._cards: dict[str, tuple[Card, float]] = {}
 
     @classmethod
     def load(cls, path: Path) -> Verifier:
@@ -175,23 +177,21 @@ class Verifier:
             self._known.pop(token, None)
             raise Unauthorised("the token has expired", hint=_HINT)
         if token not in self._known:
-            self._remember(token, known)
+            _remember(self._known, token, known)
         return caller
 
     def card(self, card: object, now_s: float) -> Card:
         """Whose key a card names; raises Unauthorised for any card that is not whole, ours and alive."""
         if not isinstance(card, str):
             raise Unauthorised("there is no card")
-        claims = self._claims(card, _card_audience(self._garden))
-        caller, expires_s = _caller(claims)
-        if now_s >= expires_s:
+        if (known := self._cards.get(card)) is None:
+            claims = self._claims(card, _card_audience(self._garden))
+            caller, expires_s = _caller(claims)
+            known = Card(caller.subject, caller.role, _confirmed(claims)), expires_s
+            _remember(self._cards, card, known)
+        if now_s >= known[1]:
             raise Unauthorised("the card has expired")
-        return Card(caller.subject, caller.role, _confirmed(claims))
-
-    def _remember(self, token: str, known: tuple[Caller, float]) -> None:
-        if len(self._known) >= _CACHE_MAX:
-            self._known.pop(next(iter(self._known)))
-        self._known[token] = known
+        return known[0]
 
     def _check(self, token: str) -> tuple[Caller, float]:
         return _caller(self._claims(token, self._audience))
@@ -206,6 +206,13 @@ class Verifier:
             return jwt.decode(token, self._garden, algorithms=["EdDSA"], audience=audience, options=options)
         except (jwt.InvalidTokenError, ValueError) as error:
             raise Unauthorised(f"the token is not one of this garden: {error}", hint=_HINT) from error
+
+
+def _remember(known: dict[str, V], text: str, what: V) -> None:
+    """The oldest is forgotten for it, when there are many."""
+    if len(known) >= _CACHE_MAX:
+        known.pop(next(iter(known)))
+    known[text] = what
 
 
 def _caller(claims: dict[str, Any]) -> tuple[Caller, float]:

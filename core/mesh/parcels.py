@@ -15,6 +15,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
+from urllib.parse import unquote
 
 from pydantic import Field
 
@@ -25,6 +26,7 @@ from core.mesh.introduction import Introducer, signed, signer
 from core.mesh.peers import Peer
 from core.wire.documents import Document, Identifier
 
+PATH = "/parcels"
 LIFE_S = 30.0
 """A seal is good so long before and after the time it names: nodes' clocks may differ by as much."""
 HOPS_MAX = 16
@@ -131,7 +133,8 @@ def opened(parcel: Parcel, verifier: Verifier, now_s: float, born_s: float) -> Q
         raise Unauthorised(f"this is a parcel of {sender.id}, and came from {parcel.via[0]}")
     number, to, method, path = (claims.get(name) for name in ("jti", "to", "method", "path"))
     texts = isinstance(number, str) and isinstance(to, str) and isinstance(path, str)
-    if not texts or len(str(number)) > 80 or method not in _METHODS or not _PATH.fullmatch(str(path)):
+    inner = unquote(str(path).partition("?")[0])
+    if not texts or len(str(number)) > 80 or method not in _METHODS or not _PATH.fullmatch(str(path)) or inner == PATH:
         raise Unprocessable("this parcel holds no request")
     headers = _headers(claims, REQUEST_HEADERS)
     return Question(sender, card.role, str(number), str(to), str(method), str(path), headers, body, float(at_s))

@@ -207,8 +207,10 @@ def finding(runtime: Runtime, node: Node) -> Sequence[Loop]:
         "mdns": MulticastDns(node.id, node.kind, node.url),
         "routes": KernelRoutes(runtime.clock, settings.discovery_port),
     }
+    # With the time, so that no number drawn in a former life is drawn again: answers to it may have been kept.
+    rng = Random(f"{settings.seed}:{node.id}:{runtime.clock.now()}")
     discovery = Discovery(
-        node.id, runtime.peers, runtime.transport, runtime.verifier, runtime.clock, Random(f"{settings.seed}:{node.id}"),
+        node.id, runtime.peers, runtime.transport, runtime.verifier, runtime.clock, rng,
         [made[name] for name in settings.discovery], loopback=urlsplit(node.url).hostname in ("127.0.0.1", "::1"),
     )  # fmt: skip
     return discovery.loops()

@@ -10,6 +10,8 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from console.processes import peers_of
 from core.scenario import Scenario
 from core.virtual import run_virtual
@@ -110,3 +112,18 @@ def test_a_relay_dies_in_the_middle_of_a_task_and_it_is_done_once_by_the_other_w
         story.unhurt(garden)
 
     tell(RING, 3, told)
+
+
+@pytest.mark.soak
+def test_a_pot_that_is_killed_under_its_permit_and_begins_anew_is_watered_once() -> None:
+    async def told(garden: Garden) -> None:
+        await story.phase(garden, "plant-1", "act")
+        await garden.kill("plant-1")
+        await garden.clock.sleep(2.0)
+        garden.start("plant-1")
+        task = await story.served(garden, "plant-1")
+        assert (task["robot_id"], task["permits"]) == ("robot-1", 1)
+        assert 0.0 < garden.truth().plant("plant-1").poured_ml <= story.allowed_ml(task)
+        story.unhurt(garden)
+
+    tell(LINE, 3, told)

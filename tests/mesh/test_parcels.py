@@ -454,6 +454,10 @@ def _no_request(air: Air) -> Parcel:
     return letter(air, "plant-3", path="http://10.0.0.9/say")
 
 
+def _a_parcel_in_a_parcel(air: Air) -> Parcel:
+    return letter(air, "plant-3", path="/%70arcels?x=1", content=letter(air, "plant-3").model_dump_json().encode())
+
+
 def _too_far(air: Air) -> Parcel:
     return letter(air, "plant-3", via=["plant-1", "plant-2", "plant-4", "plant-3"], me=air["plant-1"].me)
 
@@ -472,6 +476,7 @@ BAD = [
     _an_introduction,
     _nonsense,
     _no_request,
+    _a_parcel_in_a_parcel,
     _too_far,
 ]
 
