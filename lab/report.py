@@ -37,14 +37,21 @@ def section(result: Result) -> str:
 
 
 def write(results: Sequence[Result], folder: Path) -> Path:
-    """The report and its plots below `folder`; returns the report's path."""
+    """The report and its plots below `folder`, beside what was run before; returns the report's path."""
     for result in results:
         if result.series:
             chart = line_chart(result.name, result.axes[0], result.axes[1], result.series)
             (folder / f"reproduction-{result.name}.svg").write_text(chart)
     path = folder / "reproduction.md"
-    path.write_text(HEAD + "".join(section(result) for result in results))
+    sections = _sections(path.read_text() if path.exists() else "") | {result.name: section(result) for result in results}
+    path.write_text(HEAD + "".join(sections.values()))
     return path
+
+
+def _sections(report: str) -> dict[str, str]:
+    """What an earlier report says of each experiment: those that are not run again stay as they are."""
+    parts = report.split("\n## ")[1:]
+    return {part.split("\n", 1)[0]: f"\n## {part.rstrip()}\n" for part in parts}
 
 
 def tell(line: str) -> None:
@@ -53,7 +60,7 @@ def tell(line: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Run every experiment and write docs/reproduction.md.")
-    parser.add_argument("names", nargs="*", default=list(EXPERIMENTS), help="only these experiments")
+    parser.add_argument("names", nargs="*", default=list(EXPERIMENTS), help="only these; the report keeps the others")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--trials", type=int, help="for each; its own number if left out")
     given = parser.parse_args()

@@ -44,3 +44,14 @@ def test_a_report_shows_ours_beside_the_papers_and_what_was_missed(tmp_path):
     assert "| `error_m` | 0.1 | 0.03 | <= 0.02 | MISSED |" in text
     chart = ElementTree.fromstring((tmp_path / "reproduction-square-loop.svg").read_text())
     assert chart.tag.endswith("svg")
+
+
+def test_a_report_keeps_what_is_not_run_again(tmp_path):
+    def run(name, error_m):
+        ours = {"error_m": error_m}
+        return Result(name=name, seed=1, trials=2, paper={}, ours=ours, bars=held(ours), series={}, axes=("", ""))
+
+    whole = write([run("watering", 1.0), run("network", 2.0)], tmp_path).read_text()
+    again = write([run("watering", 3.0)], tmp_path).read_text()
+    assert again == whole.replace("| 1 |", "| 3 |") != whole
+    assert write([run("watering", 1.0)], tmp_path).read_text() == whole
