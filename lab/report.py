@@ -33,7 +33,7 @@ def section(result: Result) -> str:
     table = "\n".join(("| metric | paper | ours | bar | |", "|---|---|---|---|---|", *rows))
     picture = f"\n![{result.name}](reproduction-{result.name}.svg)\n" if result.series else ""
     notes = "".join(f"\n- {note}" for note in result.notes)
-    return f"\n## {result.name}\n\n`{command}`\n\n{table}\n{picture}{notes}"
+    return f"\n## {result.name}\n\n`{command}`\n\n{table}\n{picture}{notes}".rstrip() + "\n"
 
 
 def write(results: Sequence[Result], folder: Path) -> Path:
