@@ -319,3 +319,19 @@ def test_what_is_running_is_bid_for_with_its_rest_and_nothing_else():
     bid = price(asked(), replace(at_it, queue=(Stop(dock="far", work_s=9.0, task_id="far:1"),)))
     assert (bid.cost_s, bid.breakdown.current_s, insertion(asked(), at_it)) == (20.0, 20.0, 0)
     assert bid.breakdown.model_dump() == Breakdown(current_s=20.0).model_dump()
+
+
+def test_who_stands_behind_a_task_waits_for_its_charge_as_well():
+    weak = replace(ME, battery_ratio=0.12, queue=(Stop(dock="far", work_s=30.0, priority=3),))
+    bid = price(asked(), weak)
+    assert insertion(asked(), weak) == 0
+    later_s = done_s(bid.breakdown) + (6.0 + 30.0 + 12.0) - (40.0 + 12.0)
+    assert bid.breakdown.charge_s > 1000.0
+    assert bid.breakdown.delay_s == pytest.approx(2 * later_s)
+
+
+def test_a_stop_without_a_dock_is_done_where_the_robot_is():
+    here = replace(ME, queue=(Stop(dock="far", work_s=30.0), Stop(dock="", work_s=5.0)))
+    assert queue_s(here, here.queue) == pytest.approx(40.0 + 12.0 + 30.0 + 5.0)
+    bid = price(asked(), here)
+    assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
