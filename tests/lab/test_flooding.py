@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from itertools import permutations
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -71,6 +72,13 @@ def tell(links: list[tuple[str, str]], hops: int, told: Told) -> None:
     run_virtual(play())
 
 
+def lossy(garden: Garden, ratio: float, seed: int) -> None:
+    """From now on every message between nodes is lost so often, there and back, on each link."""
+    garden.mesh._rng = Random(seed)
+    for one, other in permutations(NODES, 2):
+        garden.mesh.leg(one, other).loss_ratio = ratio
+
+
 async def known(garden: Garden, name: str) -> dict[str, Any]:
     return {peer["id"]: (peer["source"], peer["hops"], peer["way"]) for peer in await garden.get(name, "/peers")}
 
@@ -127,3 +135,20 @@ def test_a_pot_that_is_killed_under_its_permit_and_begins_anew_is_watered_once()
         story.unhurt(garden)
 
     tell(LINE, 3, told)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("links", [LINE, RING], ids=["line", "ring"])
+def test_where_each_link_loses_one_message_in_seven_a_pot_is_still_watered_once(
+    links: list[tuple[str, str]], seed: int
+) -> None:
+    async def told(garden: Garden) -> None:
+        lossy(garden, 0.15, seed)
+        task = await story.served(garden, "plant-1", 600.0)
+        print(f"seed {seed}: {task['updated_s'] - task['created_s']:.0f} s, {task['epoch']} awards")
+        assert task["permits"] == 1
+        assert 0.0 < garden.truth().plant("plant-1").poured_ml <= story.allowed_ml(task)
+        story.unhurt(garden)
+
+    tell(links, 3, told)

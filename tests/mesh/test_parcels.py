@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager
@@ -19,16 +21,18 @@ from fastapi import FastAPI
 from fastapi.responses import StreamingResponse
 
 from core.clock import VirtualClock
-from core.errors import Forbidden, GardenError, PeerDown
+from core.errors import ConfigError, Forbidden, GardenError, PeerDown
 from core.mesh.auth import Caller, Enrolled, Identity, Verifier, make_garden
 from core.mesh.chassis import allow, body, create_app
 from core.mesh.client import Answer, HttpxTransport, Mesh
 from core.mesh.courier import LOST_S, Courier
 from core.mesh.introduction import Introducer
+from core.mesh.node import Node
 from core.mesh.parcels import BODY_BYTES_MAX, EVERYBODY, LIFE_S, ROBOTS, Parcel, ParcelAnswer, packed, sealed
 from core.mesh.peers import FLOOD, Peer, Peers
 from core.mesh.presence import add_presence, introducer
 from core.mesh.relay import FLOODS_BURST, Relay
+from core.mesh.runtime import GardenSettings, joining, make_courier
 from core.virtual import run_virtual
 from core.wire.documents import Document, NodeCard
 from lab.mesh import MemoryMesh
@@ -690,3 +694,30 @@ def test_a_refusal_of_the_far_node_is_the_callers_to_read(keys: Path) -> None:
         assert "empty" in str(told.value)
 
     play(Air(keys, LINE, 3), story)
+
+
+# ------------------------------------------------------------------ off by default
+
+
+def test_a_process_that_does_not_flood_loads_nothing_of_it_and_knows_no_parcels() -> None:
+    assert GardenSettings(flood_hops=0) == GardenSettings()
+    code = "import sys, plant_service.__main__; print(*sys.modules)"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(told.stdout.split())
+    assert "core.mesh.runtime" in loaded
+    assert loaded & {f"core.mesh.{name}" for name in ("parcels", "relay", "courier", "inside")} == set()
+
+
+@pytest.mark.parametrize(("kind", "url"), [("plant", ""), ("console", "http://10.0.0.1:8090")])
+def test_who_cannot_prove_itself_or_is_no_node_of_the_garden_cannot_pass_on(keys: Path, kind: str, url: str) -> None:
+    async def go() -> None:
+        identity, clock, peers = Identity.load(keys / "plant-1"), VirtualClock(), Peers()
+        transport = MemoryMesh(clock, Random(1)).transport("plant-1")
+        settings = GardenSettings(flood_hops=2)
+        courier = make_courier(settings, clock, identity, Verifier.load(keys), peers, HttpxTransport(transport))
+        app = create_app(card=lambda: NodeCard(id="plant-1", kind=kind), clock=clock, verifier=None, ready=list)
+        with pytest.raises(ConfigError, match="cannot pass requests on") as told:
+            joining(courier, identity, Node("plant-1", kind, app, url=url))
+        assert "GARDEN_FLOOD_HOPS" in told.value.hint
+
+    run_virtual(go())
