@@ -1,5 +1,6 @@
 """The price of a task, by a made-up garden of known distances."""
 
+import random
 from dataclasses import replace
 
 import pytest
@@ -335,3 +336,29 @@ def test_a_stop_without_a_dock_is_done_where_the_robot_is():
     assert queue_s(here, here.queue) == pytest.approx(40.0 + 12.0 + 30.0 + 5.0)
     bid = price(asked(), here)
     assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
+
+
+def test_whatever_stands_in_the_queue_the_delay_is_what_walking_through_it_takes_longer():
+    seed = 8
+    print(f"seed {seed}")
+    rng = random.Random(seed)
+    for _ in range(400):
+        kinds = (
+            {"work_s": 20.0},
+            {"work_s": 20.0, "dose_ml": rng.choice((100.0, 400.0))},
+            {"refill": True},
+            {"charge": True},
+            {"dock": "", "refill": True},
+            {"dock": "", "work_s": 7.0},
+        )
+        queue = [
+            Stop(**({"dock": rng.choice(("near", "far", "spare", "tap"))} | rng.choice(kinds)))
+            for _ in range(rng.randrange(5))
+        ]
+        me = replace(ME, tank_ml=rng.choice((150.0, 600.0, 1500.0)), queue=tuple(queue))
+        task = asked(rng.choice(("near", "spare")), dose_ml=100.0, task_id="t:1")
+        at, bid = insertion(task, me), price(task, me)
+        stop = Stop(dock=task.plant.plant_id, work_s=work_s("water", 100.0), dose_ml=100.0)
+        later_s = queue_s(me, [*queue[:at], stop, *queue[at:]]) - queue_s(me, queue)
+        put_off = len(queue) - at + 1 if queue else 0
+        assert bid.breakdown.delay_s == pytest.approx(put_off * max(0.0, later_s)), me
