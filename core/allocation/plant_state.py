@@ -116,8 +116,8 @@ class Note:
 
     kind: str
     what: str
-    task_id: str = ""
-    robot_id: str = ""
+    task_id: str
+    robot_id: str
     data: dict[str, Any] = field(default_factory=dict)
 
 

@@ -64,12 +64,15 @@ class Watched:
     modules: list[str] = field(default_factory=list)
     """Of others, that the tests import: loaded once for all mutants."""
 
-    def tests_of(self, file: str, mutant: Mutant, users: Collection[str]) -> list[str]:
-        """Those that run the mutant's statement, the quickest first; when it runs at import, all that run one of `users`."""
+    def tests_of(self, file: str, mutant: Mutant, users: Collection[str], importers: Collection[str]) -> list[str]:
+        """Those that run the mutant's statement, the quickest first.
+
+        When it runs at import: all that run one of `users`, and those of the test files `importers`.
+        """
         if mutant.lines:
             seen = [test for test in self.took_s if set(mutant.lines) & set(self.lines[test].get(file, ()))]
         else:
-            seen = [test for test in self.took_s if self.lines[test].keys() & set(users)]
+            seen = [t for t in self.took_s if self.lines[t].keys() & set(users) or t.split("::")[0] in importers]
         return sorted(seen, key=lambda test: (self.took_s[test], test))
 
 
@@ -86,6 +89,7 @@ class Trial:
         if (code := self._in_child(self._watch, 3600.0)) != 0:
             raise TestsFailError(f"pytest {' '.join(part.tests)} ends with {code} when nothing is changed")
         self.watched = Watched(**json.loads(self._told.read_text()))
+        self._test_files = {test.split("::")[0] for test in self.watched.took_s}
         for name in self.watched.modules:
             with suppress(Exception):
                 importlib.import_module(name)
@@ -98,7 +102,10 @@ class Trial:
 
     def try_one(self, file: str, mutant: Mutant) -> Outcome:
         """What the tests say to a mutant of one of the part's files."""
-        tests = self.watched.tests_of(file, mutant, _users(self._root, self._part.files, file))
+        users = _users(self._root, self._part.files, file)
+        names = {_module(each) for each in users}
+        importers = [each for each in self._test_files if _imported(self._root / each) & names]
+        tests = self.watched.tests_of(file, mutant, users, importers)
         if not tests:
             return "unreached"
         source = mutant.put_into(self.sources[file])
@@ -255,13 +262,17 @@ def _users(root: Path, files: tuple[str, ...], file: str) -> frozenset[str]:
     found, before = {file}, set[str]()
     while found != before:
         before, names = set(found), {_module(each) for each in found}
-        found |= {each for each in files if _imported((root / each).read_text()) & names}
+        found |= {each for each in files if _imported(root / each) & names}
     return frozenset(found)
 
 
-def _imported(source: str) -> set[str]:
-    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
-    return {name for node in nodes for name in (node.module or "", *(f"{node.module}.{each.name}" for each in node.names))}
+@cache
+def _imported(path: Path) -> frozenset[str]:
+    """Modules that a file imports from, and whatever it imports from them as if it were a module."""
+    nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+    return frozenset(
+        name for node in nodes for name in (node.module or "", *(f"{node.module}.{each.name}" for each in node.names))
+    )
 
 
 def _module(file: str) -> str:
