@@ -338,7 +338,7 @@ def test_a_stop_without_a_dock_is_done_where_the_robot_is():
     assert bid.cost_s == pytest.approx(total_s(bid.breakdown))
 
 
-def test_whatever_stands_in_the_queue_the_delay_is_what_walking_through_it_takes_longer():
+def test_whatever_stands_in_the_queue_the_bid_is_the_least_that_walking_through_it_can_cost():
     seed = 8
     print(f"seed {seed}")
     rng = random.Random(seed)
@@ -357,8 +357,11 @@ def test_whatever_stands_in_the_queue_the_delay_is_what_walking_through_it_takes
         ]
         me = replace(ME, tank_ml=rng.choice((150.0, 600.0, 1500.0)), queue=tuple(queue))
         task = asked(rng.choice(("near", "spare")), dose_ml=100.0, task_id="t:1")
-        at, bid = insertion(task, me), price(task, me)
         stop = Stop(dock=task.plant.plant_id, work_s=work_s("water", 100.0), dose_ml=100.0)
-        later_s = queue_s(me, [*queue[:at], stop, *queue[at:]]) - queue_s(me, queue)
-        put_off = len(queue) - at + 1 if queue else 0
-        assert bid.breakdown.delay_s == pytest.approx(put_off * max(0.0, later_s)), me
+        costs_s = []
+        for at in range(len(queue) + 1):
+            later_s = queue_s(me, [*queue[:at], stop, *queue[at:]]) - queue_s(me, queue)
+            put_off = len(queue) - at + 1 if queue else 0
+            costs_s.append(queue_s(me, [*queue[:at], stop]) + put_off * max(0.0, later_s))
+        assert price(task, me).cost_s == pytest.approx(min(costs_s)), me
+        assert costs_s[insertion(task, me)] == pytest.approx(min(costs_s)), me
