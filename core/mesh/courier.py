@@ -12,7 +12,7 @@ import structlog
 from core.errors import GardenError
 from core.mesh.client import Answer
 from core.mesh.introduction import Introducer
-from core.mesh.parcels import BODY_BYTES_MAX, EVERYBODY, Parcel, ParcelAnswer, opened_answer, packed, sealed
+from core.mesh.parcels import BODY_BYTES_MAX, EVERYBODY, WITHIN_S_MAX, Parcel, ParcelAnswer, opened_answer, packed, sealed
 from core.mesh.peers import FLOOD, Contact, Peer
 from core.mesh.relay import Relay
 
@@ -162,6 +162,7 @@ class Courier:
         self._number += 1
         number = f"{now_s:.6f}-{self._number}"
         seal = sealed(relay.me, number, to, method, path, headers, body, now_s)
+        within_s = min(within_s, WITHIN_S_MAX)
         return number, Parcel(seal=seal, body=packed(body), via=[relay.me.id], hops_left=relay.hops, within_s=within_s)
 
     def _read(self, told: list[ParcelAnswer], number: str) -> list[tuple[Peer, Answer]]:

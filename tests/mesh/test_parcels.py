@@ -31,7 +31,7 @@ from core.mesh.node import Node
 from core.mesh.parcels import BODY_BYTES_MAX, EVERYBODY, LIFE_S, ROBOTS, Parcel, ParcelAnswer, packed, sealed
 from core.mesh.peers import FLOOD, Peer, Peers
 from core.mesh.presence import add_presence, introducer
-from core.mesh.relay import FLOODS_BURST, Relay
+from core.mesh.relay import FLOODS_BURST, WORKS_MAX, Relay
 from core.mesh.runtime import GardenSettings, joining, make_courier
 from core.virtual import run_virtual
 from core.wire.documents import Document, NodeCard
@@ -437,6 +437,17 @@ def _anothers_card(air: Air) -> Parcel:
     return letter(air, "plant-3", me=Introducer(true.id, true.kind, true.url, true.card, thief.key))
 
 
+def _with_its_own_card_in_anothers_name(air: Air) -> Parcel:
+    true, thief = air["plant-3"].me, air["plant-2"].me
+    return letter(air, "plant-3", me=Introducer(true.id, true.kind, true.url, thief.card, thief.key))
+
+
+def _sealed_as_an_answer(air: Air) -> Parcel:
+    parcel = letter(air, "plant-3")
+    claims = jwt.decode(parcel.seal, options={"verify_signature": False})
+    return parcel.model_copy(update={"seal": air["plant-3"].me.sign(claims | {"aud": "answer"})})
+
+
 def _in_anothers_name(air: Air) -> Parcel:
     return letter(air, "plant-3", me=air["plant-1"].me)
 
@@ -475,6 +486,8 @@ BAD = [
     _of_before_a_restart,
     _another_garden,
     _anothers_card,
+    _with_its_own_card_in_anothers_name,
+    _sealed_as_an_answer,
     _in_anothers_name,
     _an_operators,
     _an_introduction,
@@ -532,6 +545,29 @@ def test_a_parcel_that_is_repeated_is_done_once_and_not_again_after_a_restart(ke
         air.restart("robot-1")
         assert (await handed(air, "plant-3", "robot-1", parcel)).status_code == 422
         assert air["robot-1"].did == []
+
+    play(Air(keys, LINE, 3), story)
+
+
+def test_a_parcel_is_still_known_when_its_answer_is_forgotten(keys: Path) -> None:
+    async def story(air: Air) -> None:
+        robot, first = air["robot-1"], letter(air, "plant-3", way=[])
+        await handed(air, "plant-3", "robot-1", first)
+        for n in range(WORKS_MAX + 5):
+            await handed(air, "plant-3", "robot-1", letter(air, "plant-3", number=f"more-{n}", way=[]))
+        assert len(robot.did) == WORKS_MAX + 6
+        assert (await handed(air, "plant-3", "robot-1", first)).json() == {"answers": []}
+        assert len(robot.did) == WORKS_MAX + 6
+        assert robot.relay.counts["refused"] == 1
+
+    play(Air(keys, LINE, 3), story)
+
+
+def test_no_way_is_learnt_through_somebody_who_is_not_listed_here(keys: Path) -> None:
+    async def story(air: Air) -> None:
+        air["robot-1"].peers.replace([])
+        assert set(await flooded(air["plant-1"], ROBOTS)) == {"robot-1"}
+        assert air["robot-1"].peers.contacts() == []
 
     play(Air(keys, LINE, 3), story)
 
@@ -606,8 +642,14 @@ def test_nobody_is_sent_a_token_but_those_listed_or_met_at_their_own_address(key
         air.mesh.carry = watched  # type: ignore[method-assign]
         await plant.mesh.call(plant.peer("robot-1"), "POST", "/say", Word(said="hello"), expect=Word)
         air.kill("plant-3")
+        for _ in range(3):
+            with pytest.raises(PeerDown):
+                await plant.mesh.call(plant.peer("robot-1"), "POST", "/say", Word(said="hello"), expect=Word)
+        assert plant.relay.counts["flooded"] == 2, "it is looked for once a second at most"
+        await air.clock.sleep(1.0)
         with pytest.raises(PeerDown):
             await plant.mesh.call(plant.peer("robot-1"), "POST", "/say", Word(said="hello"), expect=Word)
+        assert plant.relay.counts["flooded"] == 3
         assert {url for source, url in tokens if source == "plant-1"} == {air.urls["plant-2"]}
 
     play(Air(keys, LINE, 3), story)
