@@ -185,8 +185,6 @@ def _slew(now: float, wanted: float, step: float) -> float:
     """Gaining speed takes time; losing it does not, and turning round passes through zero."""
     if wanted * now < 0.0:
         now = 0.0
-    if abs(wanted) <= abs(now):
-        return wanted
     return math.copysign(min(abs(wanted), abs(now) + step), wanted)
 
 

@@ -309,7 +309,8 @@ def test_too_fast_either_way_is_scaled_to_the_limit(sign: float) -> None:
 
 def test_the_bases_own_docking_is_told_no_speed() -> None:
     for setpoint in (SEEK, structs.replace(SEEK, v_mps=0.3, omega_radps=1.0)):
-        assert check(setpoint, GOOD, NOW_S).command == Command(base="seek_dock")
+        for state in (GOOD, replace(GOOD, bump=True)):
+            assert check(setpoint, state, NOW_S).command == Command(base="seek_dock")
 
 
 @pytest.mark.parametrize(
@@ -377,6 +378,14 @@ def test_fingers_and_wrist_keep_to_their_ranges(setpoint: Setpoint, allowed: boo
     if allowed:
         command = check(setpoint, GOOD, NOW_S).command
         assert (command.gripper_m, command.roll_rad) == (setpoint.gripper_m, setpoint.roll_rad)
+    else:
+        assert ("roll" if setpoint.gripper_m is None else "gripper") in refused(setpoint, GOOD)
+
+
+def test_of_several_reasons_against_an_arm_move_the_first_is_said() -> None:
+    assert refused(Setpoint(seq=1, arm=(9.0, 0.5, -1.0, 0.0), arm_s=1e6), DOCKED).startswith("pan at")
+    lost = replace(DOCKED, arm_rad=None)
+    assert refused(Setpoint(seq=1, arm=(9.0, 0.5, -1.0, 0.0)), lost).startswith("pan at")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
