@@ -477,7 +477,7 @@ def test_a_restart_gives_holders_a_whole_lease_and_sends_awards_again() -> None:
     again = plant.restarted(100.0)
     assert (again.market.document().boot, again.market.document().failures) == (2, {T: 3})
     assert (again.market.due_s(), again.market.dirty) == (100.0, True)
-    assert [grant.award.epoch for grant in of(Grant, again.at(100.0))] == [1]
+    assert [(grant.award.epoch, grant.award.cost_s) for grant in of(Grant, again.at(100.0))] == [(1, 0.0)]
     again.market.award_answered(T, 1, "", 100.1)
     assert again.market.due_s() == 108.0
     again.now_s = 107.0
