@@ -682,6 +682,30 @@ def test_the_most_urgent_is_asked_for_first() -> None:
     assert [asked.announcement.priority for asked in of(Solicit, plant.at(0.0))] == [9, 5, 3]
 
 
+def test_a_declined_task_is_nobodys() -> None:
+    plant = awarded(a=10.0, b=30.0)
+    plant.market.award_answered(T, 1, "90 s by now", 1.0, overtaken=True)
+    assert plant.task(T).robot_id == ""
+
+
+def test_a_task_without_a_deadline_outlives_a_clock_that_began_anew() -> None:
+    plant = Plant(now_s=500.0).wet()
+    plant.ask()
+    assert plant.restarted(3.0).task(T).deadline_s is None
+
+
+def test_only_who_holds_the_permit_can_end_its_dose_and_that_is_written_down() -> None:
+    plant = awarded()
+    plant.permit(T)
+    plant.market.dirty = False
+    for who in ({"robot_id": "robot-2"}, {"epoch": 0}):
+        plant.report(T, "done", delivered_ml=1.0, **who)
+        assert (plant.market.soaking, plant.market.given_ml(0.0), plant.market.dirty) == (False, 150.0, False)
+    assert plant.market._water.acted(140.0, 1.0)
+    assert not plant.market._water.acted(130.0, 2.0)
+    assert plant.market.given_ml(2.0) == 140.0
+
+
 # Fruit
 
 

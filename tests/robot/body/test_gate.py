@@ -404,6 +404,7 @@ def test_a_roll_that_is_no_number_moves_nothing(value: float) -> None:
         ({"dose": Dose(debited_ml=50.0, delivered_ml=49.95)}, False),
         ({"dose": Dose(debited_ml=50.0, delivered_ml=49.94)}, True),
         ({"dose": Dose(debited_ml=1.0, delivered_ml=0.0)}, True),
+        ({"dose": Dose(debited_ml=1.0, delivered_ml=1.0)}, False),
         ({"dose": Dose(debited_ml=50.0, refusal="the cap is reached")}, True),
     ],
 )
