@@ -157,8 +157,12 @@ class TaskBook:
         elif now_s >= live.resend_s:
             live.resend_s = now_s + self.rules.resend_s
             self._effects.append(self._grant(task, live.cost_s, now_s))
-        elif now_s >= max(live.reallocate_s, self._free_s()):
+        elif now_s >= self._reallocate_s(task, live):
             self._open_round(task, "reallocate", robots, now_s)
+
+    def _reallocate_s(self, task: Task, live: Live) -> float:
+        """When all are asked again whether they would do it sooner; what runs stays where it is."""
+        return max(live.reallocate_s, self._free_s()) if task.state == "awarded" else math.inf
 
     def _task_due_s(self, task: Task) -> float:
         return min(self._next_s(task), _begin_by_s(task))
@@ -172,7 +176,7 @@ class TaskBook:
         if (permit_due_s := self._permit_due_s(task, live)) is not None:
             return permit_due_s
         overrun_s = live.running_since_s + self.rules.run_s_max
-        return min(live.lease_until_s, live.resend_s, max(live.reallocate_s, self._free_s()), overrun_s)
+        return min(live.lease_until_s, live.resend_s, self._reallocate_s(task, live), overrun_s)
 
     def _free_s(self) -> float:
         """When a further round may open at the latest, as far as is known: as many may be open at once."""

@@ -735,7 +735,7 @@ def test_a_harvest_from_the_question_to_the_last_fruit() -> None:
     plant.now_s = 6.0
     one = picked("f1", permit_id=first.permit_id)
     assert plant.report(T, "running", picks=[one], phase="act", progress=0.5)
-    assert (plant.task(T).permit_id, plant.task(T).phase, plant.market.due_s()) == ("", "act", 10.0)
+    assert (plant.task(T).permit_id, plant.task(T).phase, plant.market.due_s()) == ("", "act", 14.0)
     two = picked("f2", "unreachable", reason="too high")
     plant.now_s = 7.0
     plant.report(T, "running", picks=[one, two])

@@ -240,6 +240,24 @@ def test_a_holder_that_does_not_answer_is_asked_ever_more_seldom_until_it_does()
     assert made.task(task_id).robot_id == "robot-1"
 
 
+def test_nobody_is_asked_about_what_runs_until_it_waits_again() -> None:
+    made = market()
+    task_id = awarded(made)
+    report(made, task_id, "running", 1.0)
+
+    def asked(first_s: int, last_s: int, state: str) -> list[int]:
+        times_s = []
+        for now_s in range(first_s, last_s):
+            made.take_effects()
+            report(made, task_id, state, float(now_s))
+            made.tick(float(now_s), ROBOTS[:2])
+            times_s += [now_s for e in made.take_effects() if isinstance(e, Solicit)]
+        return times_s
+
+    assert asked(2, 30, "running") == []
+    assert asked(30, 31, "awarded") == [30]
+
+
 def test_a_holder_that_is_known_no_more_is_left_to_its_lease() -> None:
     made = market()
     task_id = awarded(made)
