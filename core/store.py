@@ -53,6 +53,12 @@ class Disk:
     def close(self, fd: int) -> None:
         os.close(fd)
 
+    def hold(self, path: Path) -> int | None:
+        """Keeps a file's blocks until `close`, also when it is unlinked; None when there is nothing to hold."""
+        with contextlib.suppress(OSError):
+            return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        return None
+
     def link(self, source: Path, target: Path) -> None:
         os.link(source, target)
 
@@ -122,7 +128,10 @@ class DurableDocument:
     """
 
     def __init__(self, path: Path, schema: str, clock: Clock, disk: Disk | None = None, gather_s: float = 0.0) -> None:
-        """A commit waits `gather_s` at most for those who shared the last one; a lone writer never waits."""
+        """A commit waits `gather_s` at most for those who shared the last one; a lone writer never waits.
+
+        Where it may wait, the disk frees the copy before last after the answer: that takes a fifth of a commit's time.
+        """
         self.path, self.schema = Path(path), schema
         self.generation = 0
         self.alarms: list[str] = []
@@ -135,6 +144,7 @@ class DurableDocument:
         self._gather_s, self._crowd = gather_s, 1
         self._crowded = asyncio.Event()
         self._writer: asyncio.Task[None] | None = None
+        self._held: int | None = None
 
     def load(self) -> Any:
         """Become the writer and return the newest valid document, or None when there never was one.
@@ -174,6 +184,7 @@ class DurableDocument:
 
     def close(self) -> None:
         """Give the file to another writer; saves that have not begun fail."""
+        self._let_go()
         if self._lock is not None:
             self._lock.close()
             self._lock = None
@@ -193,6 +204,8 @@ class DurableDocument:
             else:
                 self._crowd = len(batch) + len(self._queue)
                 _settle(batch, generation)
+            if self._held is not None:
+                await self._clock.offload(self._let_go)
         self._writer = None
 
     async def _gather(self) -> None:
@@ -229,10 +242,17 @@ class DurableDocument:
             _fsync(lambda: self._disk.fsync(fd))
         finally:
             self._disk.close(fd)
+        if self._gather_s and self._held is None:
+            self._held = self._disk.hold(older)
         _unless_absent(lambda: self._disk.unlink(older))
         _unless_absent(lambda: self._disk.link(self.path, older))
         self._disk.rename(temporary, self.path)
         _fsync(lambda: self._disk.fsync_dir(self.path.parent))
+
+    def _let_go(self) -> None:
+        held, self._held = self._held, None
+        if held is not None:
+            self._disk.close(held)
 
     def _write_all(self, fd: int, data: bytes) -> None:
         left = memoryview(data)

@@ -87,6 +87,9 @@ class SoakDisk(Disk):
     def close(self, fd: int) -> None:
         self._open.pop(fd, None)
 
+    def hold(self, path: Path) -> int | None:
+        return None
+
     def link(self, source: Path, target: Path) -> None:
         self._about("link", target)
         if source not in self._platter.names:

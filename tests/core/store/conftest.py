@@ -84,6 +84,9 @@ class SimDisk(Disk):
     def close(self, fd: int) -> None:
         return
 
+    def hold(self, path: Path) -> int | None:
+        return None
+
     def link(self, source: Path, target: Path) -> None:
         self.step()
         if source.name not in self.names:

@@ -211,6 +211,83 @@ def test_a_lone_writer_never_waits_for_others(tmp_path: Path) -> None:
     assert written_by(tmp_path / "a", 1, 20, 0.5) == written_by(tmp_path / "b", 1, 20, 0.0)
 
 
+class Telling(Disk):
+    """Says in which order it is called, and fails to rename as often as it is told."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.failures = 0
+        self._held = set[int]()
+
+    def hold(self, path: Path) -> int | None:
+        if (fd := super().hold(path)) is not None:
+            self._held.add(fd)
+            self.calls.append("hold")
+        return fd
+
+    def unlink(self, path: Path) -> None:
+        super().unlink(path)
+        self.calls.append("unlink")
+
+    def rename(self, source: Path, target: Path) -> None:
+        if self.failures:
+            self.failures -= 1
+            raise OSError(errno.ENOSPC, "full")
+        super().rename(source, target)
+
+    def fsync_dir(self, path: Path) -> None:
+        super().fsync_dir(path)
+        self.calls.append("durable")
+
+    def close(self, fd: int) -> None:
+        super().close(fd)
+        if fd in self._held:
+            self._held.discard(fd)
+            self.calls.append("let go")
+
+
+@pytest.mark.parametrize(
+    ("gather_s", "freed"), [(0.0, ["unlink", "durable"]), (0.01, ["hold", "unlink", "durable", "let go"])]
+)
+def test_where_writers_follow_each_other_the_copy_before_last_is_freed_once_the_new_one_is_durable(
+    tmp_path: Path, gather_s: float, freed: list[str]
+) -> None:
+    disk = Telling()
+
+    async def main() -> None:
+        file = DurableDocument(tmp_path / "doc.json", "test/1", VirtualClock(), disk, gather_s)
+        file.load()
+        for n in range(4):
+            await file.save({"n": n})
+            await asyncio.sleep(1.0)
+        file.close()
+
+    run_virtual(main())
+    assert disk.calls == ["durable", "durable", *freed, *freed]
+
+
+def test_a_copy_that_is_held_is_let_go_when_the_commit_fails_and_when_the_file_is_closed(tmp_path: Path) -> None:
+    disk = Telling()
+
+    async def main() -> None:
+        file = DurableDocument(tmp_path / "doc.json", "test/1", VirtualClock(), disk, 0.01)
+        file.load()
+        for n in range(2):
+            await file.save({"n": n})
+        disk.failures, disk.calls = 1, []
+        with pytest.raises(StorageError, match="full"):
+            await file.save({"n": 2})
+        await asyncio.sleep(1.0)
+        assert disk.calls == ["hold", "unlink", "let go"]
+        disk.calls = []
+        file.commit({"n": 3})
+        file.commit({"n": 4})
+        file.close()
+        assert disk.calls == ["hold", "unlink", "durable", "unlink", "durable", "let go"]
+
+    run_virtual(main())
+
+
 def test_any_damaged_byte_is_noticed_and_the_older_copy_used(tmp_path: Path) -> None:
     seed = 2026
     print("seed", seed)
