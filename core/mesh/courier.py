@@ -106,22 +106,13 @@ class Courier:
         body: bytes,
         within_s: float,
         heard: Callable[[Peer, Answer], None],
-    ) -> None:
-        """Ask all that `to` means (`parcels.ROBOTS`, `EVERYBODY`), within the limit of hops; each is heard once."""
-        await self._flood(to, method, path, headers, body, within_s, heard)
-
-    async def _flood(
-        self,
-        to: str,
-        method: str,
-        path: str,
-        headers: Mapping[str, str],
-        body: bytes,
-        within_s: float,
-        heard: Callable[[Peer, Answer], None],
         *,
         all_of_them: bool = False,
     ) -> None:
+        """Ask all that `to` means (`parcels.ROBOTS`, `EVERYBODY`), within the limit of hops; each is heard once.
+
+        With `all_of_them` also by way of neighbours that were silent lately.
+        """
         number, parcel = self._parcel(to, method, path, headers, body, within_s)
         self._relay.counts["flooded"] += 1
         known: set[str] = set()
@@ -201,7 +192,7 @@ class Courier:
 
     async def look_around(self) -> None:
         """One flood to everybody, also by neighbours that were silent; whoever was not heard for long is lost."""
-        await self._flood(EVERYBODY, "GET", "/healthz", {}, b"", LOOK_WITHIN_S, lambda peer, answer: None, all_of_them=True)
+        await self.flood(EVERYBODY, "GET", "/healthz", {}, b"", LOOK_WITHIN_S, lambda peer, answer: None, all_of_them=True)
         peers, now_s = self._relay.peers, self._relay.clock.now()
         for contact in peers.contacts():
             if contact.source == FLOOD and now_s - (contact.seen_s or 0.0) > LOST_S and peers.lost(contact.peer.id):
