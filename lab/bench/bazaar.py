@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-import resource
 import sys
 import time
 from collections import Counter
@@ -275,7 +274,6 @@ async def _serve(plan: Plan) -> dict[str, Any]:
     counts = sum((hawker.counts for hawker in hawkers), Counter[str]())
     return {
         "cpu_s": cpu_s,
-        "rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         "counts": dict(counts),
         "served": [task_id for hawker in hawkers for task_id in hawker.served],
     }

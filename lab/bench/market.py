@@ -33,6 +33,7 @@ from core.wire.geometry import Point3, Pose2
 from core.wire.market import FINAL_STATES, PlantCard, Task, TaskRequest
 from lab.bench.bazaar import FOR_EVER_S, KEY, Plan, shares
 from lab.bench.clearing import clear, compiled
+from lab.bench.pot import rss_mb
 from lab.crowd import KIND, RULES, TOGETHER_S, Crowd, Instance, between_s
 
 Row = dict[str, Any]
@@ -250,8 +251,9 @@ async def _running(plans: Sequence[Plan]) -> AsyncIterator[list[asyncio.subproce
 
 async def _stop(process: asyncio.subprocess.Process) -> Row:
     assert process.stdin is not None
+    taken_mb = rss_mb(process.pid)
     process.stdin.write(b"\n")
-    return await _line(process)
+    return await _line(process) | {"rss_mb": taken_mb}
 
 
 async def _line(process: asyncio.subprocess.Process) -> Row:

@@ -131,7 +131,7 @@ async def running_pot(folder: Path, more: Mapping[str, str]) -> AsyncIterator[di
         token = (folder / "keys" / "operator" / "token").read_text().strip()
         yield {
             "port": port, "get": "/inventory", "post": "/inventory/fruits", "token": token, "pid": process.pid,
-            "ready_s": ready_s, "rss_mb": _rss_mb(process.pid),
+            "ready_s": ready_s, "rss_mb": rss_mb(process.pid),
         }  # fmt: skip
     finally:
         await _end(process)
@@ -228,7 +228,8 @@ async def _idle(pid: int, over_s: float = 5.0) -> float:
     return (used_s() - before_s) / over_s
 
 
-def _rss_mb(pid: int) -> float:
+def rss_mb(pid: int) -> float:
+    """What a process has in memory now."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("VmRSS"):
             return int(line.split()[1]) / 1024
