@@ -87,6 +87,15 @@ def test_of_rounds_that_began_one_after_the_other_the_first_to_end_makes_room():
     assert late.announcement.task_id.endswith(str(BOUND + 1))
 
 
+def test_a_task_that_was_cancelled_makes_room_at_once():
+    made = market(BOUND + 1)
+    first = asked(made, 0.0)
+    made.cancel(first[0].announcement.task_id, "operator", "", 0.5)
+    made.take_effects()
+    assert made.due_s() <= 0.5
+    assert len(asked(made, 0.5)) == 1
+
+
 def test_a_holder_is_asked_for_its_price_only_when_there_is_room_for_a_round():
     made, rules = market(0), Rules()
     made.fruits([fruit(number) for number in range(2000)], 0.0)

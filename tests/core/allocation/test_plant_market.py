@@ -437,7 +437,9 @@ def test_a_robot_that_fails_again_and_again_ends_the_task() -> None:
         for ask in [e for e in made.take_effects() if isinstance(e, Solicit)]:
             made.bid(task_id, ask.round_number, "robot-1", bid("robot-1", 5.0, task_id), now_s)
         epoch = made.task(task_id).epoch
+        report(made, task_id, "running", now_s, epoch=epoch, progress=0.3)
         report(made, task_id, "failed", now_s, epoch=epoch, reason="cannot dock")
+        assert made.task(task_id).progress == (0.0 if made.task(task_id).state == "announced" else 0.3)
     assert epoch == 8
     assert "cannot dock" in made.task(task_id).reason
     assert now_s > 60.0
