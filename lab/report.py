@@ -66,10 +66,8 @@ def main() -> None:
     given = parser.parse_args()
     results = []
     for name in given.names:
-        print(f"{name} ...", file=sys.stderr)
-        results.append(
-            run_experiment(name, given.trials or TRIALS.get(name), given.seed, None, lambda s: print(s, file=sys.stderr))
-        )
+        tell(f"{name} ...")
+        results.append(run_experiment(name, given.trials or TRIALS.get(name), given.seed, None, tell))
     print(write(results, DOCS))
     if not all(result.ok for result in results):
         sys.exit("a bar was missed: see the report")

@@ -14,7 +14,7 @@ from core.allocation.plant_side import Market
 from core.allocation.plant_state import Effect, Grant, Kill, MarketDocument, Note, Solicit
 from core.clock import Clock
 from core.errors import GardenError, Overtaken, PeerDown, StorageError
-from core.mesh.client import Answer, Mesh
+from core.mesh.client import ROBOTS, Answer, Mesh
 from core.mesh.peers import Peers
 from core.wire.documents import Problem
 from core.wire.market import Bid
@@ -27,8 +27,6 @@ NAP_S_MIN = 0.01
 STORAGE_NAP_S = 5.0
 KILL_TRIES = 3
 KILL_AGAIN_S = 1.0
-EVERY_ROBOT = "*robot"
-"""The address of a flood (`core.mesh.parcels`, which is loaded only where flooding is on)."""
 
 
 class Marketplace:
@@ -114,7 +112,7 @@ class Marketplace:
             self._keeper.machine.bid(task_id, ask.round_number, robot_id, bid, self._clock.now())
             self._wake.set()
 
-        await self._mesh.ask_all(peers, "POST", "/bids", ask.announcement, expect=Bid, each=answered, flood_to=EVERY_ROBOT)
+        await self._mesh.ask_all(peers, "POST", "/bids", ask.announcement, expect=Bid, each=answered, flood_to=ROBOTS)
 
     async def _grant(self, grant: Grant) -> None:
         award = grant.award

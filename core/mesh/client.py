@@ -40,6 +40,8 @@ ANSWER_BYTES_MAX = 4 * 1024 * 1024
 AT_ONCE_MAX = 256
 FLOOD_BYTES_MAX = 45_000
 """A longer body does not fit into a parcel."""
+ROBOTS = "*robot"
+"""All robots, as the address of a flood; here, since `core.mesh.parcels` is loaded only where flooding is on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +194,8 @@ class Mesh:
     ) -> dict[str, D | GardenError]:
         """Ask many at once, the body serialised once; every peer has its entry, an error in place of a missing answer.
 
-        `each` is called with every peer's answer as it comes in. Where requests may be flooded, `flood_to` (an address of
-        `core.mesh.parcels`) lets one flood ask them all.
+        `each` is called with every peer's answer as it comes in. Where requests may be flooded, `flood_to` (`ROBOTS`
+        or another address of `core.mesh.parcels`) lets one flood ask them all.
         """
         content = _dump(body)
         if flood_to and self._carrier is not None and len(content) <= FLOOD_BYTES_MAX:

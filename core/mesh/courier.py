@@ -109,7 +109,7 @@ class Courier:
         *,
         all_of_them: bool = False,
     ) -> None:
-        """Ask all that `to` means (`parcels.ROBOTS`, `EVERYBODY`), within the limit of hops; each is heard once.
+        """Ask all that `to` means (`client.ROBOTS`, `EVERYBODY`), within the limit of hops; each is heard once.
 
         With `all_of_them` also by way of neighbours that were silent lately.
         """

@@ -35,8 +35,8 @@ BODY_BYTES_MAX = FLOOD_BYTES_MAX
 ANSWERS_MAX = 64
 """A node hands back no more to a flood."""
 WITHIN_S_MAX = 30.0
-EVERYBODY, ROBOTS = "*", "*robot"
-"""Addresses of floods: no node's id begins with an asterisk."""
+EVERYBODY = "*"
+"""The address of a flood, as `client.ROBOTS` is: no node's id begins with an asterisk."""
 REQUEST_HEADERS = ("content-type", "idempotency-key", "if-match", "if-none-match")
 ANSWER_HEADERS = ("content-type", "etag", "location")
 _METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE")

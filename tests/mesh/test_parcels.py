@@ -24,11 +24,11 @@ from core.clock import VirtualClock
 from core.errors import ConfigError, Forbidden, GardenError, PeerDown
 from core.mesh.auth import Caller, Enrolled, Identity, Verifier, make_garden
 from core.mesh.chassis import allow, body, create_app
-from core.mesh.client import Answer, HttpxTransport, Mesh
+from core.mesh.client import ROBOTS, Answer, HttpxTransport, Mesh
 from core.mesh.courier import LOST_S, Courier
 from core.mesh.introduction import Introducer
 from core.mesh.node import Node
-from core.mesh.parcels import BODY_BYTES_MAX, EVERYBODY, LIFE_S, ROBOTS, Parcel, ParcelAnswer, packed, sealed
+from core.mesh.parcels import BODY_BYTES_MAX, EVERYBODY, LIFE_S, Parcel, ParcelAnswer, packed, sealed
 from core.mesh.peers import FLOOD, Peer, Peers
 from core.mesh.presence import add_presence, introducer
 from core.mesh.relay import FLOODS_BURST, WORKS_MAX, Relay
