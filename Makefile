@@ -43,7 +43,8 @@ reproduce: $(STAMP)
 	$(BIN)/python -m lab.report $(ARGS)
 
 soak: $(STAMP)
-	$(BIN)/python -m pytest -m soak $(ARGS)
+	$(BIN)/python -m pytest -m "soak and not alone" --numprocesses auto --dist worksteal --durations=0 $(ARGS) $(OR_NONE)
+	$(BIN)/python -m pytest -m "soak and alone" --durations=0 $(ARGS) $(OR_NONE)
 
 mutants: $(STAMP)
 	$(BIN)/python -m lab.mutants $(ARGS)

@@ -37,6 +37,7 @@ def ringed(jpeg):
 
 
 @pytest.mark.soak
+@pytest.mark.alone
 def test_within_three_minutes_there_were_scans_a_harvest_and_a_picture_with_rings(tmp_path):
     scenario = find("garden")
     began_s = time.monotonic()

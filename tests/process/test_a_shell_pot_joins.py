@@ -78,6 +78,7 @@ def running(garden: RealGarden, port: int) -> Iterator[str]:
 
 
 @pytest.mark.soak
+@pytest.mark.alone
 @pytest.mark.skipif(bool(MISSING), reason=f"the example needs {', '.join(MISSING)}: see examples/cgi-pot/README.md")
 def test_a_pot_in_shell_joins_the_garden_asks_for_water_and_gets_it(tmp_path):
     scenario = with_one_neighbour(load(EXAMPLE / "garden.toml"))

@@ -27,6 +27,7 @@ def marked(value: str) -> list[str]:
 
 
 @pytest.mark.soak
+@pytest.mark.alone
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for processes in /proc")
 def test_the_killed_robots_task_is_done_by_the_other_and_no_process_is_left(tmp_path: Path) -> None:
     done = subprocess.run(
@@ -53,6 +54,7 @@ def test_the_killed_robots_task_is_done_by_the_other_and_no_process_is_left(tmp_
 
 
 @pytest.mark.soak
+@pytest.mark.alone
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for processes in /proc")
 def test_ended_by_a_signal_it_leaves_no_process_either(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "console.cli", "demo", "--json", "--data", str(tmp_path)]

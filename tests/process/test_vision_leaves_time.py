@@ -6,6 +6,7 @@ from lab.bench.vision import bench_vision
 
 
 @pytest.mark.soak
+@pytest.mark.alone
 def test_a_robot_at_a_plant_answers_bids_at_once_and_its_body_keeps_50_hz():
     rows = {row["name"]: row for row in bench_vision(3)}
     print(rows)
