@@ -26,7 +26,6 @@ from core.allocation.epochs import owner_of
 from core.clock import Clock, WallClock
 from core.errors import BadRequest, GardenError, NotFound, PeerDown
 from core.mesh.client import Mesh
-from core.mesh.http import HttpTransport
 from core.mesh.peers import Peer, PeerKind, Peers
 from core.wire.documents import Document, HistoryEntry
 from core.wire.market import Task, TaskRequest
@@ -60,10 +59,10 @@ class Line:
 async def open_line(data: Path, role: str = "") -> AsyncIterator[Line]:
     """With a `role`, requests carry that role's token."""
     folder = Folder(data)
-    clock = WallClock()
-    mesh = Mesh(HttpTransport(), folder.identity(role) if role else None, clock, timeout_s=3.0)
+    clock, peers = WallClock(), Peers(folder.peers())
+    mesh = Mesh(folder.transport(peers), folder.identity(role) if role else None, clock, timeout_s=3.0)
     try:
-        yield Line(mesh, Peers(folder.peers()), clock)
+        yield Line(mesh, peers, clock)
     finally:
         await mesh.aclose()
 

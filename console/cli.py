@@ -23,6 +23,9 @@ GROUP = "garden.commands"
 
 Data = Annotated[Path, typer.Option("--data", envvar="GARDEN_DATA", help="The garden's data folder")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON")]
+Tls = Annotated[
+    bool, typer.Option("--tls", help="HTTPS, with the garden's own certificates (as `tls = true` in a scenario)")
+]
 DATA = Path("data")
 
 
@@ -77,6 +80,7 @@ def up(
     data: Data = DATA,
     fresh: Annotated[bool, typer.Option("--fresh", help="A new world instead of the last one, gone on with")] = False,
     shift: Annotated[int, typer.Option(envvar="GARDEN_SHIFT", help="Add this to every port")] = 0,
+    tls: Tls = False,
     as_json: Json = False,
 ) -> None:
     """Start a whole garden here: world, pots, station, robots, console. Ctrl-C ends it."""
@@ -85,7 +89,7 @@ def up(
     from console.up import Wish
     from console.up import up as start
 
-    start(Wish(scenario, Folder(data), World(seed, speed, fresh), shift, as_json))
+    start(Wish(scenario, Folder(data), World(seed, speed, fresh), shift, tls, as_json))
 
 
 @app.command()
@@ -311,20 +315,23 @@ def doctor(data: Data = DATA, as_json: Json = False) -> None:
 @app.command()
 def compose(
     scenario: Annotated[str, typer.Option(help="A built-in scenario's name, or a file")] = "garden",
+    tls: Tls = False,
     as_json: Json = False,
 ) -> None:
     """Print the docker-compose.yml of a scenario."""
     from console.compose import compose as write
 
-    write(scenario, as_json)
+    write(scenario, as_json, tls)
 
 
 @app.command()
-def manifests(scenario: Annotated[str, typer.Option(help="A built-in scenario's name")] = "garden") -> None:
+def manifests(
+    scenario: Annotated[str, typer.Option(help="A built-in scenario's name")] = "garden", tls: Tls = False
+) -> None:
     """Print the Kubernetes objects of a scenario."""
     from console.kubernetes import manifests as written
 
-    print(written(scenario), end="")
+    print(written(scenario, tls), end="")
 
 
 @app.command()

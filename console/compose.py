@@ -30,9 +30,9 @@ def place(scenario: str) -> Place:
     )
 
 
-def compose(scenario: str, as_json: bool) -> None:
+def compose(scenario: str, as_json: bool, tls: bool = False) -> None:
     built_in = (scenarios.SCENARIOS_DIR / scenario).is_dir()
-    document = describe(scenarios.find(scenario), scenario if built_in else _MOUNTED)
+    document = describe(scenarios.find(scenario, tls), scenario if built_in else _MOUNTED)
     if not built_in:
         path = Path(scenario).resolve()
         path = path / "scenario.toml" if path.is_dir() else path

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import ssl
 import tempfile
 import time
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 
 from pydantic import TypeAdapter, ValidationError
@@ -15,8 +17,11 @@ from pydantic import TypeAdapter, ValidationError
 from console.processes import SOCKET_PATH_MAX, Place, enrolled, peers_of
 from core import scenario as scenarios
 from core.errors import ConfigError
+from core.mesh import tls
 from core.mesh.auth import Enrolled, Identity, make_garden
-from core.mesh.peers import Peer
+from core.mesh.authority import certify
+from core.mesh.http import HttpTransport
+from core.mesh.peers import Peer, Peers
 from core.scenario import Scenario
 
 LOCALHOST = "127.0.0.1"
@@ -61,9 +66,11 @@ class Folder:
         return Path(tempfile.gettempdir()) / f"garden-{os.getuid()}-{name}.sock"
 
     def enrol(self, scenario: Scenario, more: tuple[Enrolled, ...] = ()) -> list[str]:
-        """Make the keys and tokens that are missing; tells which."""
+        """Make the keys, tokens and certificates that are missing; tells which."""
+        nodes = [*enrolled(scenario), *more]
         # Tokens live in Unix time: the clock of a real garden, and never reached by a simulated one.
-        return make_garden(self.keys, [*enrolled(scenario), *more], time.time())
+        made = make_garden(self.keys, nodes, time.time())
+        return list(dict.fromkeys([*made, *certify(self.keys, nodes, datetime.now(UTC))]))
 
     def remember(self, scenario: Scenario) -> None:
         """Write down who answers where, for the other commands."""
@@ -76,6 +83,18 @@ class Folder:
         if token := os.environ.get("GARDEN_TOKEN"):
             return Identity("operator", role, token)
         return Identity.load(self.keys / role)
+
+    def transport(self, peers: Peers) -> HttpTransport:
+        """The way to `peers`: by the garden's certificates where they speak TLS and this folder has them."""
+        holder = self.keys / "operator"
+        if (holder / tls.AUTHORITY).exists() and any(peer.url.startswith("https:") for peer in peers.all()):
+            return HttpTransport(tls.asking(holder), peers.at)
+        return HttpTransport()
+
+    def trusted(self) -> ssl.SSLContext | None:
+        """For programs that look at addresses; None where this folder has no certificates."""
+        holder = self.keys / "operator"
+        return tls.by_address(holder) if (holder / tls.AUTHORITY).exists() else None
 
     def peers_written(self) -> list[Peer]:
         """What `remember` wrote."""

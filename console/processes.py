@@ -86,8 +86,8 @@ def peers_of(scenario: Scenario, host: Callable[[str], str]) -> list[Peer]:
     kinds: dict[str, PeerKind] = {"sim": "sim", scenario.station.id: "station", "console": "console"}
     kinds.update({plant.id: "plant" for plant in scenario.plants})
     kinds.update({robot.id: "robot" for robot in scenario.robots})
-    ports = ports_of(scenario)
-    return [Peer(id=name, kind=kind, url=f"http://{host(name)}:{ports[name]}") for name, kind in kinds.items()]
+    ports, scheme = ports_of(scenario), "https" if scenario.tls else "http"
+    return [Peer(id=name, kind=kind, url=f"{scheme}://{host(name)}:{ports[name]}") for name, kind in kinds.items()]
 
 
 def processes(scenario: Scenario, place: Place, world: World | None = None) -> list[Process]:
@@ -211,6 +211,8 @@ class _Maker:
         }
         if port is not None:
             env["GARDEN_PORT"] = str(port)
+        if self._scenario.tls:
+            env["GARDEN_TLS"] = "true"
         return Process(name, kind, module, env | own, keys or name, port, depends, devices)
 
     def _data(self, name: str) -> str:

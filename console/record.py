@@ -12,6 +12,7 @@ import contextlib
 import json
 import math
 import signal
+import ssl
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from typing import IO, TYPE_CHECKING, Any
 from pydantic import BaseModel, TypeAdapter
 
 from console.ask import Line, open_line
+from console.folder import Folder
 from core.clock import Clock, WallClock, WorldClock
 from core.errors import BadRequest, ConfigError, GardenError
 from core.mesh import worldclock
@@ -207,14 +209,14 @@ class Recorder:
 
 
 @contextlib.asynccontextmanager
-async def garden_time(line: Line) -> AsyncIterator[Clock]:
+async def garden_time(line: Line, tls: ssl.SSLContext | None = None) -> AsyncIterator[Clock]:
     """A simulated garden's clock, or the wall's where there is no world."""
     worlds = line.peers.of_kind("sim")
     if not worlds:
         yield WallClock()
         return
     clock = WorldClock()
-    following = asyncio.create_task(worldclock.follow(clock, worlds[0].url))
+    following = asyncio.create_task(worldclock.follow(clock, worlds[0].url, tls=tls))
     try:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(FIRST_TIME_S):
@@ -253,7 +255,7 @@ async def _record(tape: Tape, for_s: float | None, every: Every, data: Path) -> 
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.set)
-    async with open_line(data) as line, garden_time(line) as clock:
+    async with open_line(data) as line, garden_time(line, Folder(data).trusted()) as clock:
         running = asyncio.create_task(Recorder(line, clock, tape, every).run())
         waiting = asyncio.create_task(ended.wait())
         try:

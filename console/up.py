@@ -8,6 +8,7 @@ import fcntl
 import json
 import os
 import signal
+import ssl
 import sys
 from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -26,8 +27,8 @@ from core.clock import WallClock
 from core.errors import ConfigError, GardenError
 from core.mesh.chassis import Readiness
 from core.mesh.client import Mesh
-from core.mesh.http import HttpTransport
-from core.mesh.peers import Peer
+from core.mesh.peers import Peer, Peers
+from core.mesh.tls import AUTHORITY
 from core.scenario import Scenario
 from core.wire.documents import HistoryEntry
 
@@ -46,6 +47,7 @@ class Wish:
     folder: Folder
     world: World
     shift: int = 0
+    tls: bool = False
     as_json: bool = False
 
 
@@ -91,7 +93,7 @@ def _first(group: BaseExceptionGroup[GardenError]) -> GardenError:
 
 def prepared(wish: Wish) -> Scenario:
     """The scenario as it will run, written to the data folder; raises ConfigError naming every mistake."""
-    scenario = scenarios.find(wish.scenario)
+    scenario = scenarios.find(wish.scenario, wish.tls)
     try:
         scenario = toml.shifted(scenario, wish.shift)
     except ValidationError as error:
@@ -137,9 +139,9 @@ async def _up(wish: Wish, scenario: Scenario, listed: Sequence[Process]) -> None
 
 async def _greet(wish: Wish, scenario: Scenario, runner: Runner, voice: Voice) -> None:
     """Wait until everybody answers, say so, then tell what the pots tell."""
-    mesh = Mesh(HttpTransport(), None, WallClock(), timeout_s=5.0)
     ours = {process.name for process in runner.processes}
     peers = {peer.id: peer for peer in wish.folder.peers_written() if peer.id in ours}
+    mesh = Mesh(wish.folder.transport(Peers(peers.values())), None, WallClock(), timeout_s=5.0)
     began_s = asyncio.get_running_loop().time()
     try:
         async with asyncio.timeout(READY_WITHIN_S), asyncio.TaskGroup() as group:
@@ -154,7 +156,8 @@ async def _greet(wish: Wish, scenario: Scenario, runner: Runner, voice: Voice) -
     for child in runner.children.values():
         child.ready = True
     _say_ready(wish, scenario, peers, voice, asyncio.get_running_loop().time() - began_s)
-    await tell_events([peer for peer in peers.values() if peer.kind in ("plant", "station")], voice)
+    pots = [peer for peer in peers.values() if peer.kind in ("plant", "station")]
+    await tell_events(pots, voice, wish.folder.trusted() if scenario.tls else None)
 
 
 async def _wait_ready(mesh: Mesh, name: str, peer: Peer, runner: Runner, voice: Voice, began_s: float) -> None:
@@ -182,22 +185,24 @@ def _say_ready(wish: Wish, scenario: Scenario, peers: dict[str, Peer], voice: Vo
     plant = next((peer for peer in peers.values() if peer.kind == "plant"), peers[scenario.station.id])
     robot = scenario.robots[0].id
     data = "" if wish.folder.root == Path("data") else f" --data {wish.folder.root}"
+    curl = f"curl --cacert {wish.folder.keys / AUTHORITY} -s" if scenario.tls else "curl -s"
     lines = [
         f"Garden ready after {seconds:.1f} s. Ctrl-C ends it.",
         f"  the garden in a browser:  {peers['console'].url}",
         f"  the world from above:     {peers['sim'].url}/overview.jpg",
-        f"  curl -s {plant.url}/state",
-        f"  curl -s {peers[robot].url}/state",
-        f'  curl -s -X POST {plant.url}/tasks -H "Authorization: Bearer $(.venv/bin/garden token{data})"'
+        f"  {curl} {plant.url}/state",
+        f"  {curl} {peers[robot].url}/state",
+        f'  {curl} -X POST {plant.url}/tasks -H "Authorization: Bearer $(.venv/bin/garden token{data})"'
         ' -d \'{"kind": "water", "dose_ml": 100}\'',
     ]
     urls = {peer.id: peer.url for peer in peers.values()}
     voice.say("\n".join(lines), garden="ready", urls=urls, seconds=round(seconds, 2))
 
 
-async def tell_events(peers: Sequence[Peer], voice: Voice) -> None:
+async def tell_events(peers: Sequence[Peer], voice: Voice, tls: ssl.SSLContext | None = None) -> None:
     """Follow the event streams of `peers` for ever."""
-    async with httpx.AsyncClient(timeout=httpx.Timeout(5.0, read=60.0)) as http, asyncio.TaskGroup() as group:
+    patience = httpx.Timeout(5.0, read=60.0)
+    async with httpx.AsyncClient(timeout=patience, verify=tls or True) as http, asyncio.TaskGroup() as group:
         for peer in peers:
             group.create_task(_tell(http, peer, voice))
 

@@ -132,6 +132,8 @@ class Scenario(_Section):
     name: Identifier = "garden"
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 7
     speed: Annotated[float, Field(gt=0, le=100)] = 3.0
+    tls: bool = False
+    """Services speak HTTPS, with certificates of the garden's own authority."""
     arena: Arena = Arena()
     climate: Climate = Climate()
     plants: tuple[Plant, ...] = Field(min_length=1, max_length=12)
@@ -250,7 +252,8 @@ def _told(error: ValidationError) -> Iterator[str]:
         yield f"{where}: {item['msg']}" if where else str(item["msg"]).removeprefix("Value error, ")
 
 
-def find(name: str) -> Scenario:
-    """A built-in scenario by name, or any path to one."""
+def find(name: str, tls: bool = False) -> Scenario:
+    """A built-in scenario by name, or any path to one; `tls` has it speak HTTPS even where the file does not say so."""
     inside = SCENARIOS_DIR / name
-    return load(inside if inside.is_dir() else Path(name))
+    scenario = load(inside if inside.is_dir() else Path(name))
+    return scenario.model_copy(update={"tls": True}) if tls else scenario

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import random
 
+import httpx
 from pydantic import ValidationError
 
 from core.errors import ConfigError
 from core.mesh.node import Node
-from core.mesh.runtime import Runtime, run
+from core.mesh.runtime import Runtime, key_folder, run
+from core.mesh.tls import by_address
 from hw.links import open_link
 from robot_service.brain import build
 from robot_service.settings import RobotSettings
@@ -33,6 +35,7 @@ async def make(runtime: Runtime) -> Node:
         verifier=runtime.verifier,
         peers=runtime.peers,
         open_reads=runtime.settings.open_reads,
+        cameras=httpx.AsyncHTTPTransport(verify=by_address(key_folder(runtime.settings))) if runtime.settings.tls else None,
     )
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import os
 import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 from core.errors import ConfigError, Unauthorised
+from core.mesh import keyfiles
 
 V = TypeVar("V")
 ROLES = ("plant", "robot", "operator", "viewer")
@@ -56,10 +56,13 @@ class Identity:
     @classmethod
     def load(cls, folder: Path) -> Identity:
         """Read `folder/token`, and `card` and `node.key` where they are; raises ConfigError when there is no token."""
-        token = _read(folder / "token").decode("ascii", "replace").strip()
+        token = keyfiles.read(folder / "token").decode("ascii", "replace").strip()
         card, key = "", None
         if (folder / "card").exists() and (folder / "node.key").exists():
-            card, key = _read(folder / "card").decode("ascii", "replace").strip(), GardenKey.load(folder / "node.key").key
+            card, key = (
+                keyfiles.read(folder / "card").decode("ascii", "replace").strip(),
+                GardenKey.load(folder / "node.key").key,
+            )
         try:
             claims = jwt.decode(token, options={"verify_signature": False})
             return cls(str(claims["sub"]), str(claims["role"]), token, card, key)
@@ -94,7 +97,7 @@ class GardenKey:
     @classmethod
     def load(cls, path: Path) -> GardenKey:
         try:
-            key = serialization.load_pem_private_key(_read(path), password=None)
+            key = serialization.load_pem_private_key(keyfiles.read(path), password=None)
         except (ValueError, TypeError, UnsupportedAlgorithm) as error:
             raise ConfigError(f"{path} holds no key", hint="run `garden init`") from error
         if not isinstance(key, Ed25519PrivateKey):
@@ -160,7 +163,7 @@ class Verifier:
         """From a `garden.pub` file, or a folder that holds one."""
         path = path / "garden.pub" if path.is_dir() else path
         try:
-            key = serialization.load_pem_public_key(_read(path))
+            key = serialization.load_pem_public_key(keyfiles.read(path))
         except (ValueError, UnsupportedAlgorithm) as error:
             raise ConfigError(f"{path} holds no public key", hint="run `garden init`") from error
         if not isinstance(key, Ed25519PublicKey):
@@ -246,15 +249,15 @@ def make_garden(folder: Path, nodes: Iterable[Enrolled], now_s: float, life_s: f
     folder.mkdir(parents=True, exist_ok=True, mode=0o755)
     key_path = folder / "garden.key"
     if not key_path.exists():
-        _write(key_path, _private_pem(GardenKey.generate().key))
+        keyfiles.write(key_path, keyfiles.private_pem(GardenKey.generate().key))
         made.append("garden.key")
     garden = GardenKey.load(key_path)
-    public_pem = _public_pem(garden.public())
-    _write(folder / "garden.pub", public_pem, mode=0o644)
+    public_pem = keyfiles.public_pem(garden.public())
+    keyfiles.write(folder / "garden.pub", public_pem, mode=0o644)
     for node in (*nodes, Enrolled("operator", "operator"), Enrolled("viewer", "viewer")):
         if _enrol(folder / node.id, node, garden, now_s, life_s):
             made.append(node.id)
-        _write(folder / node.id / "garden.pub", public_pem, mode=0o644)
+        keyfiles.write(folder / node.id / "garden.pub", public_pem, mode=0o644)
     return made
 
 
@@ -263,16 +266,16 @@ def _enrol(folder: Path, node: Enrolled, garden: GardenKey, now_s: float, life_s
     folder.mkdir(exist_ok=True, mode=0o755)
     key_path, token_path = folder / "node.key", folder / "token"
     if not key_path.exists():
-        _write(key_path, _private_pem(Ed25519PrivateKey.generate()))
+        keyfiles.write(key_path, keyfiles.private_pem(Ed25519PrivateKey.generate()))
     if node.secret and not (folder / "body.secret").exists():
-        _write(folder / "body.secret", secrets.token_hex(32).encode())
+        keyfiles.write(folder / "body.secret", secrets.token_hex(32).encode())
     if token_path.exists() and _alive(folder, garden, now_s):
         return False
     public = GardenKey.load(key_path).public()
-    # The token names the node's own key too, so that a TLS link can be held against it.
+    # As RFC 7800 has it: a token that says whose it is.
     identity = garden.issue(node.id, node.role, now_s, life_s, cnf=_confirmation(public))
-    _write(folder / "card", garden.card(node.id, node.role, public, now_s, life_s).encode())
-    _write(token_path, identity.token.encode())
+    keyfiles.write(folder / "card", garden.card(node.id, node.role, public, now_s, life_s).encode())
+    keyfiles.write(token_path, identity.token.encode())
     return True
 
 
@@ -280,36 +283,8 @@ def _alive(folder: Path, garden: GardenKey, now_s: float) -> bool:
     """Whether token and card are there and hold."""
     verifier = garden.verifier()
     try:
-        verifier.verify(_read(folder / "token").decode("ascii", "replace").strip(), now_s)
-        verifier.card(_read(folder / "card").decode("ascii", "replace").strip(), now_s)
+        verifier.verify(keyfiles.read(folder / "token").decode("ascii", "replace").strip(), now_s)
+        verifier.card(keyfiles.read(folder / "card").decode("ascii", "replace").strip(), now_s)
     except (Unauthorised, ConfigError):
         return False
     return True
-
-
-def _private_pem(key: Ed25519PrivateKey) -> bytes:
-    kind = serialization.PrivateFormat.PKCS8
-    return key.private_bytes(serialization.Encoding.PEM, kind, serialization.NoEncryption())
-
-
-def _public_pem(key: Ed25519PublicKey) -> bytes:
-    return key.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}", hint="run `garden init`") from error
-
-
-def _write(path: Path, data: bytes, mode: int = 0o600) -> None:
-    """Whole or not at all, and never readable by others on the way."""
-    draft = path.with_name(path.name + ".tmp")
-    handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
-    try:
-        os.write(handle, data)
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-    draft.replace(path)

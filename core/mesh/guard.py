@@ -7,6 +7,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import structlog
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
@@ -23,6 +24,10 @@ KEPT_FOR_S = 600.0
 _OPEN_PATHS = frozenset({"/healthz", "/readyz", "/introduction"})
 VOUCHED = "garden.caller"
 """Where in an ASGI scope a request has its Caller that came under a seal, not with a token. Servers put nothing there."""
+LINK = "garden.link"
+"""Where in an ASGI scope a request over TLS has the node whose certificate was shown, "" without one."""
+_BOUND = frozenset({"plant", "robot"})
+"""Roles whose tokens are taken, over TLS, from their own node alone; people ask from anywhere."""
 _READS = frozenset({"GET", "HEAD", "OPTIONS"})
 _METHODS = _READS | {"POST", "PUT", "PATCH", "DELETE"}
 BROKEN = GardenError("something broke in here", hint="the log says what")
@@ -48,7 +53,16 @@ def bearer(headers: Headers) -> str:
 
 def caller_of(scope: Scope, verifier: Verifier, now_s: float) -> Caller:
     """Who asks; raises Unauthorised."""
-    return scope.get(VOUCHED) or verifier.verify(bearer(scope["headers"]), now_s)
+    if (vouched := scope.get(VOUCHED)) is not None:
+        return cast(Caller, vouched)
+    caller = verifier.verify(bearer(scope["headers"]), now_s)
+    link = scope.get(LINK)
+    if link is not None and link != caller.subject and caller.role in _BOUND:
+        raise Unauthorised(
+            f"the token is {caller.subject}'s, and {link or 'nobody'} showed a certificate",
+            hint=f"over TLS {caller.subject} shows its own certificate",
+        )
+    return caller
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from urllib.parse import quote, urlsplit
 
 from core.errors import BadRequest
 from core.mesh.client import ANSWER_BYTES_MAX, Answer
+from core.mesh.tls import name_in
 
 KEPT_S = 25.0
 """Shorter than our servers keep an idle connection, so that no request meets one that is closing."""
@@ -38,6 +39,8 @@ class _Target:
 
     place: tuple[str, int, bool]
     """Host, port, with TLS."""
+    origin: str
+    """Scheme, host and port as they were written."""
     start: str
     """What follows the method in a request's first lines."""
 
@@ -45,20 +48,27 @@ class _Target:
 class HttpTransport:
     """A PeerTransport over TCP. The caller holds the time-out."""
 
-    def __init__(self, tls: ssl.SSLContext | None = None) -> None:
-        self._tls = tls
+    def __init__(self, tls: ssl.SSLContext | None = None, expected: Callable[[str], str | None] | None = None) -> None:
+        """`expected` tells which node answers at an address (`https://HOST:PORT`), None for a stranger's.
+
+        With it nobody is asked but over TLS, and nobody answers in another's place (`core.mesh.tls`).
+        """
+        self._tls, self._expected = tls, expected
         self._hosts: dict[tuple[str, int, bool], _Host] = {}
         self._targets: dict[str, _Target] = {}
         self._open: set[_Connection] = set()
 
     async def send(self, method: str, url: str, headers: Mapping[str, str], body: bytes) -> Answer:
         target = self._target(url)
+        if self._expected is not None and not target.place[2]:
+            raise ConnectionError("it would be asked in plain HTTP, and this garden speaks TLS")
         data = _request(method, target, headers, body)
         if (host := self._hosts.get(target.place)) is None:
             host = self._hosts[target.place] = _Host()
         await host.enter()
         if (connection := host.kept()) is not None:
             try:
+                self._check(connection, target, host)
                 return await connection.ask(data, method == "HEAD", host.left)
             except ConnectionResetError:
                 # It was closing while we wrote: a GET may simply be asked again, on a new connection.
@@ -70,7 +80,16 @@ class HttpTransport:
         except BaseException:
             host.leave()
             raise
+        self._check(connection, target, host)
         return await connection.ask(data, method == "HEAD", host.left)
+
+    def _check(self, connection: _Connection, target: _Target, host: _Host) -> None:
+        """Hang up, before anything is said, when another node answers than should; raises ConnectionError."""
+        expected = self._expected(target.origin) if self._expected is not None else None
+        if expected is not None and connection.name != expected:
+            connection.close()
+            host.leave()
+            raise ConnectionError(f"{connection.name or 'a node without a name'} answers there, not {expected}")
 
     async def aclose(self) -> None:
         for host in self._hosts.values():
@@ -106,7 +125,8 @@ def _parsed(url: str) -> _Target:
         what = quote(what, safe="/%:=&?~+!$,;'@()*._-")
     host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
     port = parts.port or (443 if tls else 80)
-    return _Target((parts.hostname, port, tls), f" {what} HTTP/1.1\r\nhost: {host}:{port}\r\n")
+    origin = f"{parts.scheme}://{parts.netloc}"
+    return _Target((parts.hostname, port, tls), origin, f" {what} HTTP/1.1\r\nhost: {host}:{port}\r\n")
 
 
 def _request(method: str, target: _Target, headers: Mapping[str, str], body: bytes) -> bytes:
@@ -189,10 +209,13 @@ class _Connection(asyncio.Protocol):
         self._reader = _Reader(headless=False)
         self.used_s = 0.0
         self.reusable = False
+        self.name = ""
+        """The node that answers, by its certificate."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
+        self.name = name_in(transport.get_extra_info("peercert"))
         self._open.add(self)
 
     async def ask(self, data: bytes, headless: bool, left: Callable[[_Connection], None]) -> Answer:

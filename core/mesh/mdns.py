@@ -70,7 +70,7 @@ class MulticastDns:
 
     async def _resolve(self, info: Any, zeroconf: Any, name: str) -> None:
         if await info.async_request(zeroconf, RESOLVE_MS) and (addresses := info.parsed_addresses()):
-            self._seen[name] = Hint(f"http://{addresses[0]}:{info.port}")
+            self._seen[name] = Hint(f"{urlsplit(self.url).scheme}://{addresses[0]}:{info.port}")
             self._changed.set()
 
 

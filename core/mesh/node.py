@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import ssl
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -29,11 +30,16 @@ class Node:
 
 
 async def serve(
-    node: Node, host: str, port: int, clock_loops: Sequence[Loop] = (), sock: socket.socket | None = None
+    node: Node,
+    host: str,
+    port: int,
+    clock_loops: Sequence[Loop] = (),
+    sock: socket.socket | None = None,
+    tls: ssl.SSLContext | None = None,
 ) -> None:
     """Serve until SIGTERM or SIGINT; a loop that dies ends all, and its error is raised (as an ExceptionGroup)."""
     sock = sock or listen(host, port)
-    server = make_server(node.app)
+    server = make_server(node.app, tls)
     on_signals(server)
     lag = LoopLag()
     measure(node.app.state.registry, lag.readings)

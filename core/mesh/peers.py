@@ -112,6 +112,10 @@ class Peers:
         known = self._contacts.get(id)
         return None if known is None else known.peer
 
+    def at(self, url: str) -> str | None:
+        """Who is known to answer at an address."""
+        return next((c.peer.id for c in self._contacts.values() if c.in_reach and c.peer.url == url), None)
+
     def contact(self, id: str) -> Contact | None:
         return self._contacts.get(id)
 

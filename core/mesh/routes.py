@@ -28,6 +28,7 @@ class KernelRoutes:
 
     clock: Clock
     port: int
+    scheme: str = "http"
     name: str = "kernel routes"
 
     async def run(self, seen: Callable[[list[Hint]], None]) -> None:
@@ -39,13 +40,13 @@ class KernelRoutes:
         async with AsyncIPRoute() as kernel:
             while True:
                 routes = [route async for route in await kernel.get_routes(family=AF_INET)]
-                if (hints := hosts(routes, self.port)) != last:
+                if (hints := hosts(routes, self.port, self.scheme)) != last:
                     seen(hints)
                     last = hints
                 await self.clock.sleep(EVERY_S)
 
 
-def hosts(routes: Iterable[Any], port: int) -> list[Hint]:
+def hosts(routes: Iterable[Any], port: int, scheme: str = "http") -> list[Hint]:
     """The peers that kernel routes hint at, nearest first."""
     found: dict[str, int] = {}
     for route in routes:
@@ -54,4 +55,5 @@ def hosts(routes: Iterable[Any], port: int) -> list[Hint]:
         known = route["proto"] in HOP_PROTOCOLS and route["type"] == _UNICAST and route["dst_len"] == _HOST_BITS
         if known and 0 < hops < 256 and "RTA_DST" in told:
             found[told["RTA_DST"]] = min(hops, found.get(told["RTA_DST"], 255))
-    return [Hint(f"http://{host}:{port}", hops) for host, hops in sorted(found.items(), key=lambda item: (item[1], item[0]))]
+    nearest_first = sorted(found.items(), key=lambda item: (item[1], item[0]))
+    return [Hint(f"{scheme}://{host}:{port}", hops) for host, hops in nearest_first]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import ssl
 import sys
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from core.clock import Clock, WallClock, WorldClock
 from core.errors import ConfigError, GardenError
+from core.mesh import tls
 from core.mesh.auth import Identity, Verifier
 from core.mesh.client import Mesh, PeerTransport
 from core.mesh.introduction import ROLE_OF
@@ -53,6 +55,8 @@ class GardenSettings(BaseSettings):
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 0
     log: Literal["auto", "json", "text"] = "auto"
+    tls: bool = False
+    """Answer and ask over TLS alone, with the garden's certificates."""
     open_reads: bool = True
     """Reading needs no token. Right only while the port is published on loopback."""
     seed: int = 0
@@ -88,7 +92,15 @@ def make_clock(settings: GardenSettings) -> tuple[Clock, Sequence[Loop]]:
     from core.mesh import worldclock
 
     clock = WorldClock()
-    return clock, (lambda: worldclock.follow(clock, settings.clock),)
+    trusted = tls.by_address(key_folder(settings)) if settings.tls else None
+    return clock, (lambda: worldclock.follow(clock, settings.clock, tls=trusted),)
+
+
+def key_folder(settings: GardenSettings) -> Path:
+    """Raises ConfigError when the settings name none."""
+    if settings.keys is None:
+        raise ConfigError("GARDEN_KEYS names no key folder", hint="run `garden init`, then set GARDEN_KEYS=DATA/keys/NODE")
+    return settings.keys
 
 
 def make_runtime(settings: GardenSettings | None = None) -> Runtime:
@@ -96,11 +108,11 @@ def make_runtime(settings: GardenSettings | None = None) -> Runtime:
     from core.mesh.http import HttpTransport
 
     settings = settings or GardenSettings()
+    keys = key_folder(settings)
     clock, clock_loops = make_clock(settings)
-    if settings.keys is None:
-        raise ConfigError("GARDEN_KEYS names no key folder", hint="run `garden init`, then set GARDEN_KEYS=DATA/keys/NODE")
-    identity, verifier = Identity.load(settings.keys), Verifier.load(settings.keys)
-    peers, transport = Peers(settings.peers, settings.hops_max), HttpTransport()
+    identity, verifier = Identity.load(keys), Verifier.load(keys)
+    peers = Peers(settings.peers, settings.hops_max)
+    transport = HttpTransport(tls.asking(keys), peers.at) if settings.tls else HttpTransport()
     courier = make_courier(settings, clock, identity, verifier, peers, transport)
     return Runtime(settings, clock, clock_loops, identity, verifier, peers, courier or transport, courier)
 
@@ -185,11 +197,22 @@ async def _run(build: Builder, settings: GardenSettings) -> None:
             node = await build(runtime)
             structlog.contextvars.bind_contextvars(node=node.id)
             loops = (*finding(runtime, node), *joining(runtime.courier, runtime.identity, node))
-            await serve(node, settings.host, settings.port, loops)
+            await serve(node, settings.host, settings.port, loops, tls=links(settings, node))
             for task in clocks:
                 task.cancel()
     finally:
         await runtime.transport.aclose()
+
+
+def links(settings: GardenSettings, node: Node) -> ssl.SSLContext | None:
+    """What this node answers with where the garden speaks TLS; raises ConfigError."""
+    if not settings.tls:
+        return None
+    if node.url.startswith("http:"):
+        raise ConfigError(
+            f"{node.id} says that it answers at {node.url}", hint="under GARDEN_TLS its URL begins with https://"
+        )
+    return tls.serving(key_folder(settings))
 
 
 def finding(runtime: Runtime, node: Node) -> Sequence[Loop]:
@@ -205,7 +228,7 @@ def finding(runtime: Runtime, node: Node) -> Sequence[Loop]:
         raise ConfigError(f"{node.id} does not know its own URL, so nobody can find it", hint="set PLANT_URL or ROBOT_URL")
     made: dict[str, Source] = {
         "mdns": MulticastDns(node.id, node.kind, node.url),
-        "routes": KernelRoutes(runtime.clock, settings.discovery_port),
+        "routes": KernelRoutes(runtime.clock, settings.discovery_port, urlsplit(node.url).scheme),
     }
     # With the time, so that no number drawn in a former life is drawn again: answers to it may have been kept.
     rng = Random(f"{settings.seed}:{node.id}:{runtime.clock.now()}")

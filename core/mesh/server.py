@@ -7,6 +7,7 @@ import contextlib
 import re
 import signal
 import socket
+import ssl
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -17,6 +18,8 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from core.errors import ConfigError
 from core.mesh.chassis import front
+from core.mesh.guard import LINK
+from core.mesh.tls import name_in
 
 REQUEST_WITHIN_S = 5.0
 """A request, body included, must have come in within this many seconds of its first byte."""
@@ -75,9 +78,13 @@ class ImpatientProtocol(HttpToolsProtocol):
     _ready: ReadyAnswer | None = None
     """The last plain GET, byte for byte, and what answers it."""
     _answered_s = 0.0
+    _link: str | None = None
+    """Who is at the other end, by its certificate; None without TLS."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        if (link := transport.get_extra_info("ssl_object")) is not None:
+            self._link = name_in(link.getpeercert())
         self.transport = _Corked(transport, self.loop)  # type: ignore[assignment]
         self._deadline = self.loop.call_later(REQUEST_WITHIN_S, self._too_slow)
 
@@ -98,6 +105,8 @@ class ImpatientProtocol(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         self._in_head = False
         super().on_headers_complete()
+        if self._link is not None:
+            self.scope[LINK] = self._link  # type: ignore[literal-required]
 
     def on_message_complete(self) -> None:
         super().on_message_complete()
@@ -201,7 +210,11 @@ class _Corked:
 
 
 class Server(uvicorn.Server):
-    """Leaves signals to `core.mesh.node`."""
+    """Leaves signals to `core.mesh.node`, and listens by itself."""
+
+    def __init__(self, config: uvicorn.Config, tls: ssl.SSLContext | None = None) -> None:
+        super().__init__(config)
+        self._tls = tls
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -210,8 +223,24 @@ class Server(uvicorn.Server):
     def handle_exit(self, sig: int, frame: Any) -> None:
         self.should_exit = True
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """As uvicorn's, which would leave a client a whole minute to shake hands."""
+        await super().startup(sockets=[])
+        config, loop = self.config, asyncio.get_running_loop()
+        patience_s = REQUEST_WITHIN_S if self._tls else None
 
-def make_server(app: FastAPI) -> Server:
+        def accepted() -> asyncio.Protocol:
+            return ImpatientProtocol(config, self.server_state, self.lifespan.state)
+
+        for sock in sockets or ():
+            listening = await loop.create_server(
+                accepted, sock=sock, ssl=self._tls, ssl_handshake_timeout=patience_s, backlog=config.backlog
+            )
+            self.servers.append(listening)
+
+
+def make_server(app: FastAPI, tls: ssl.SSLContext | None = None) -> Server:
+    """With `tls` (`core.mesh.tls.serving`) it speaks HTTPS and nothing else."""
     config = uvicorn.Config(
         front(app),
         http=ImpatientProtocol,
@@ -227,7 +256,7 @@ def make_server(app: FastAPI) -> Server:
         timeout_graceful_shutdown=1,
     )
     config.ready = {path: ReadyAnswer(make) for path, make in app.state.ready_bytes.items()}  # type: ignore[attr-defined]
-    return Server(config)
+    return Server(config, tls)
 
 
 def listen(host: str, port: int) -> socket.socket:

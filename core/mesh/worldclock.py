@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import ssl
 from typing import Annotated
 
 import httpx
@@ -24,15 +25,18 @@ class ClockBeat(Document):
     rate: Annotated[float, Field(ge=0, le=1000)]
 
 
-async def follow(clock: WorldClock, url: str, http: httpx.AsyncClient | None = None) -> None:
+async def follow(
+    clock: WorldClock, url: str, http: httpx.AsyncClient | None = None, tls: ssl.SSLContext | None = None
+) -> None:
     """Steer `clock` by the feed at `url`, reconnecting for ever; a lost world stops it after SILENCE_S.
 
-    `url` is the world's address (`http://127.0.0.1:8090`). Waits in wall seconds: garden time stands still meanwhile.
+    `url` is the world's address (`http://127.0.0.1:8090`); `tls` is for one of https. Waits in wall seconds: garden time
+    stands still meanwhile.
     """
     feed_url = url.rstrip("/") + "/clock/feed"
     if http is not None:
         await _follow(clock, feed_url, http)
-    async with httpx.AsyncClient() as own:
+    async with httpx.AsyncClient(verify=tls or True) as own:
         await _follow(clock, feed_url, own)
 
 

@@ -12,7 +12,8 @@ import pytest
 from fastapi import FastAPI
 from typer.testing import CliRunner, Result
 
-from console import ask, cli
+from console import cli
+from console import folder as folder_module
 from console.folder import Folder
 from console.service import build
 from console.snapshot import Snapshot
@@ -153,7 +154,7 @@ def street(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Street:
     apps = {peer.url: pot(peer.id, verifier) for peer in folder.peers() if peer.kind == "plant"}
     apps |= {peer.url: robot(peer.id, verifier) for peer in folder.peers() if peer.kind == "robot"}
     there = Street({int(url.rpartition(":")[2]): app for url, app in apps.items()})
-    monkeypatch.setattr(ask, "HttpTransport", lambda: HttpxTransport(there))
+    monkeypatch.setattr(folder_module, "HttpTransport", lambda: HttpxTransport(there))
     return there
 
 

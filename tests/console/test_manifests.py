@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -96,3 +97,13 @@ def test_nobody_comes_in_but_the_garden_itself_and_device_wires_are_their_owners
 def test_a_scenario_that_is_not_in_the_image_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="image"):
         manifests(str(tmp_path / "mine.toml"))
+
+
+def test_under_tls_probes_shake_hands_too() -> None:
+    objects = list(yaml.safe_load_all(manifests("garden", tls=True)))
+    told = [json.dumps(each) for each in objects if each["kind"] == "StatefulSet"]
+    assert len(told) == len(SETS)
+    for document in objects:
+        judge(document)
+    assert all(text.count('"httpGet"') == text.count('"scheme": "HTTPS"') > 0 for text in told)
+    assert not any("http://" in text for text in told)

@@ -7,13 +7,16 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
-from console import toml
+from console import cli, toml
 from console.compose import compose, describe, place, render
 from console.folder import Folder
-from console.processes import World, enrolled, ports_of, processes
+from console.processes import Place, World, enrolled, ports_of, processes
 from core import scenario as scenarios
+from core.mesh import tls
 from core.mesh.peers import Peer
+from core.mesh.runtime import GardenSettings
 from core.scenario import Scenario, device_ports
 from plant_service.settings import PlantSettings
 from robot_service.body.settings import BodySettings
@@ -40,6 +43,33 @@ def test_an_external_pot_is_a_peer_with_port_keys_and_probe_but_no_process_of_ou
     assert last.id in {node.id for node in enrolled(garden)}
     assert last.id in {peer["id"] for process in listed for peer in json.loads(process.env["GARDEN_PEERS"])}
     assert device_ports(garden)[f"{last.id}.soil"] in listed[0].devices
+
+
+@pytest.mark.parametrize("there", [Folder(Path("data")).place(), place("garden")], ids=["here", "container"])
+def test_under_tls_every_address_is_https_and_every_process_is_told(there: Place) -> None:
+    for process in processes(scenarios.find("garden", tls=True), there):
+        assert process.env["GARDEN_TLS"] == "true", process.name
+        assert "http://" not in json.dumps(process.env), process.name
+        GardenSettings(clock=process.env["GARDEN_CLOCK"], tls=True)
+    assert not any("GARDEN_TLS" in process.env for process in processes(GARDEN, there))
+
+
+def test_tls_is_one_word_in_a_scenario_and_one_on_the_command_line(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(toml.dump(GARDEN.model_copy(update={"tls": True})))
+    assert scenarios.find(str(tmp_path / "mine.toml")).tls
+    assert not GARDEN.tls
+    assert scenarios.find("garden", tls=True) == GARDEN.model_copy(update={"tls": True})
+    printed = CliRunner().invoke(cli.app, ["compose", "--tls", "--json"])
+    assert '"GARDEN_TLS": "true"' in printed.stdout
+
+
+def test_whoever_enrols_gets_certificates_for_all_and_an_authority_for_people(tmp_path: Path) -> None:
+    folder = Folder(tmp_path)
+    folder.enrol(GARDEN)
+    for node in enrolled(GARDEN):
+        tls.serving(folder.keys / node.id)
+    assert folder.trusted() is not None
+    assert Folder(tmp_path / "nothing").trusted() is None
 
 
 SETTINGS = {

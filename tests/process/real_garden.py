@@ -44,7 +44,8 @@ class Watched:
         self.folder.logs.mkdir()
         self.listed = {p.name: p for p in processes(self.scenario, self.folder.place(), World(speed=speed))}
         token = self.folder.identity().token
-        self._http = httpx.Client(headers={"authorization": f"Bearer {token}"}, timeout=5.0)
+        headers = {"authorization": f"Bearer {token}"}
+        self._http = httpx.Client(headers=headers, timeout=5.0, verify=self.folder.trusted() or True)
 
     def get(self, name: str, path: str) -> Any:
         return self._http.get(self._url(name) + path).raise_for_status().json()
@@ -57,7 +58,7 @@ class Watched:
         return self._http.get(self._url(robot) + "/camera.jpg", timeout=20.0).raise_for_status()
 
     def _url(self, name: str) -> str:
-        return f"http://127.0.0.1:{self.listed[name].port}"
+        return f"{'https' if self.scenario.tls else 'http'}://127.0.0.1:{self.listed[name].port}"
 
     def until(self, true: Callable[[], bool], within_s: float) -> None:
         """Poll; a service that does not answer yet is not an error. Wall seconds."""
