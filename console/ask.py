@@ -24,14 +24,14 @@ from console.snapshot import all_tasks, look
 from console.story import Story, remembered, tell
 from core.allocation.epochs import owner_of
 from core.clock import Clock, WallClock
-from core.errors import BadRequest, GardenError, NotFound, PeerDown
+from core.errors import BadRequest, GardenError, NotFound, PeerDown, Unavailable
 from core.mesh.client import Mesh
 from core.mesh.peers import Peer, PeerKind, Peers
 from core.wire.documents import Document, HistoryEntry
 from core.wire.market import Task, TaskRequest
 from core.wire.order import Order, OrderPart, OrderRequest
 from core.wire.plant import PlantState
-from core.wire.robot import Job, JobKind, JobRequest, RobotState, Stopped, StopRequest
+from core.wire.robot import Job, JobKind, JobRequest, ResumeRequest, RobotState, Stopped, StopRequest
 
 T = TypeVar("T")
 WATCH_S = 1.0
@@ -274,30 +274,56 @@ def _request(model: type[D], **fields: Any) -> D:
         raise BadRequest(told or str(error)) from error
 
 
-async def _each_robot(line: Line, robot: str, path: str, body: Document | None) -> list[Stopped]:
-    """At one robot or at all; all are asked even when some do not answer, then the first error is raised."""
+async def _each(line: Line, robot: str, what: str, tell: Callable[[Peer], Awaitable[Stopped]]) -> list[Stopped]:
+    """At one robot or at all; all are told even when some do not answer, then the first error is raised."""
+
+    async def told(peer: Peer) -> Stopped | GardenError:
+        try:
+            return await tell(peer)
+        except GardenError as error:
+            print(f"garden: {peer.id} did NOT {what}: {error}", file=sys.stderr)
+            return error
+
     asked = [line.peer(robot, "robot")] if robot else line.peers.of_kind("robot")
-    answers = await line.mesh.ask_all(asked, "POST", path, body, expect=Stopped)
-    failed = {name: answer for name, answer in answers.items() if isinstance(answer, GardenError)}
-    for name, error in failed.items():
-        print(f"garden: {name} did NOT answer: {error}", file=sys.stderr)
-    if failed:
-        raise next(iter(failed.values()))
-    return [answer for answer in answers.values() if isinstance(answer, Stopped)]
+    answers = await asyncio.gather(*map(told, asked))
+    if failed := [answer for answer in answers if isinstance(answer, GardenError)]:
+        raise failed[0]
+    return [answer for answer in answers if isinstance(answer, Stopped)]
+
+
+async def _resume(line: Line, peer: Peer, stop_number: int) -> Stopped:
+    """Release the stop of this number, or the one that is latched when 0; a robot that is not stopped is left alone."""
+    if not stop_number:
+        state = await line.mesh.call(peer, "GET", "/state", expect=RobotState)
+        if not state.stopped:
+            return Stopped(robot_id=peer.id, stopped=False)
+        if not state.stop_number:
+            raise Unavailable(f"the stop of {peer.id} is not written down", hint="look at its disk, then stop it again")
+        stop_number = state.stop_number
+    wish = _request(ResumeRequest, stop_number=stop_number)
+    return await line.mesh.call(peer, "POST", "/resume", wish, expect=Stopped)
 
 
 def _told_stopped(listed: list[Stopped]) -> str:
-    return "\n".join(f"{one.robot_id}: {f'stopped by {one.by}' if one.stopped else 'goes on'}" for one in listed)
+    return "\n".join(
+        f"{one.robot_id}: {f'stopped by {one.by} (stop {one.stop_number})' if one.stopped else 'goes on'}" for one in listed
+    )
 
 
 def stop(robot: str, reason: str, data: Path, as_json: bool) -> None:
     request = _request(StopRequest, reason=reason)
-    stopped = _run(data, "operator", lambda line: _each_robot(line, robot, "/stop", request))
+
+    def run(line: Line) -> Awaitable[list[Stopped]]:
+        return _each(line, robot, "stop", lambda peer: line.mesh.call(peer, "POST", "/stop", request, expect=Stopped))
+
+    stopped = _run(data, "operator", run)
     _show(stopped, as_json, lambda: _told_stopped(stopped))
 
 
-def resume(robot: str, data: Path, as_json: bool) -> None:
-    stopped = _run(data, "operator", lambda line: _each_robot(line, robot, "/resume", None))
+def resume(robot: str, stop_number: int, data: Path, as_json: bool) -> None:
+    if stop_number and not robot:
+        raise BadRequest("which robot's stop is that?", hint=f"garden resume ROBOT --stop {stop_number}")
+    stopped = _run(data, "operator", lambda line: _each(line, robot, "go on", lambda peer: _resume(line, peer, stop_number)))
     _show(stopped, as_json, lambda: _told_stopped(stopped))
 
 

@@ -251,11 +251,16 @@ def stop(
 
 
 @app.command()
-def resume(robot: AnyRobot = "", data: Data = DATA, as_json: Json = False) -> None:
+def resume(
+    robot: AnyRobot = "",
+    stop: Annotated[int, typer.Option(help="Which stop, as `garden robots` shows it; the one latched now if not given")] = 0,
+    data: Data = DATA,
+    as_json: Json = False,
+) -> None:
     """Let stopped robots go on."""
     from console import ask
 
-    ask.resume(robot, data, as_json)
+    ask.resume(robot, stop, data, as_json)
 
 
 @app.command(context_settings={"ignore_unknown_options": True})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import Annotated, TypeVar
 
@@ -22,7 +23,7 @@ from core.mesh.runtime import Runtime
 from core.wire.documents import Document, NodeCard
 from core.wire.market import Task, TaskRequest
 from core.wire.order import Order, OrderPart, OrderRequest
-from core.wire.robot import Stopped, StopRequest
+from core.wire.robot import ResumeAllRequest, ResumeRequest, Stopped, StopRequest
 
 D = TypeVar("D", bound=Document)
 PICTURE_WITHIN_S = 20.0
@@ -103,16 +104,15 @@ def _add_reads(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
 
 
 def _add_buttons(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
-    async def all_robots(path: str, content: bytes, token: str) -> Answers:
-        async def tell(robot: Peer) -> Stopped | GardenError:
+    async def all_robots(path: str, wishes: Mapping[str, Document], token: str) -> Answers:
+        async def tell(name: str, wish: Document) -> Stopped | GardenError:
             try:
-                return await _pass_on(mesh, robot, path, content, token, Stopped)
+                return await _pass_on(mesh, _robot(peers, name), path, wish.model_dump_json().encode(), token, Stopped)
             except GardenError as error:
                 return error
 
-        robots = peers.of_kind("robot")
-        answers = await asyncio.gather(*(tell(robot) for robot in robots))
-        errors = {robot.id: str(a) for robot, a in zip(robots, answers, strict=True) if isinstance(a, GardenError)}
+        answers = await asyncio.gather(*(tell(name, wish) for name, wish in wishes.items()))
+        errors = {name: str(a) for name, a in zip(wishes, answers, strict=True) if isinstance(a, GardenError)}
         return Answers(robots=[a for a in answers if isinstance(a, Stopped)], errors=errors)
 
     @app.post("/api/stop", tags=["buttons"], summary="Stop every robot")
@@ -121,11 +121,18 @@ def _add_buttons(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
         caller: Caller = allow("plant", "robot", "operator", "viewer"),
         request: StopRequest = body(StopRequest),
     ) -> Answers:
-        return await all_robots("/stop", request.model_dump_json().encode(), authorization)
+        return await all_robots("/stop", {robot.id: request for robot in peers.of_kind("robot")}, authorization)
 
-    @app.post("/api/resume", tags=["buttons"], summary="Let every robot go on")
-    async def resume(authorization: Token = "", caller: Caller = allow("operator")) -> Answers:
-        return await all_robots("/resume", b"", authorization)
+    named = "GET /api/garden tells every robot's stop_number; send those that are meant"
+
+    @app.post("/api/resume", tags=["buttons"], summary="Let robots go on from the stops that are named")
+    async def resume(
+        authorization: Token = "",
+        caller: Caller = allow("operator"),
+        request: ResumeAllRequest = body(ResumeAllRequest, hint=named),
+    ) -> Answers:
+        wishes = {stop.robot_id: ResumeRequest(stop_number=stop.stop_number) for stop in request.stops}
+        return await all_robots("/resume", wishes, authorization)
 
     @app.post("/api/plants/{plant_id}/water", tags=["buttons"], summary="Ask a pot to be watered")
     async def water(
@@ -139,6 +146,14 @@ def _add_buttons(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
             raise NotFound(f"no plant {plant_id!r}", hint=f"known: {', '.join(pot.id for pot in pots) or 'none'}")
         content = request.model_dump_json().encode()
         return await _pass_on(mesh, pot, "/tasks", content, authorization, Task)
+
+
+def _robot(peers: Peers, name: str) -> Peer:
+    """Raises NotFound."""
+    robots = peers.of_kind("robot")
+    if (robot := next((robot for robot in robots if robot.id == name), None)) is None:
+        raise NotFound(f"no robot {name!r}", hint=f"known: {', '.join(robot.id for robot in robots) or 'none'}")
+    return robot
 
 
 class Counter:

@@ -60,7 +60,8 @@ def robots(states: Sequence[RobotState]) -> Table:
         pose = state.pose
         where = "?" if pose is None else f"{pose.x_m:+.2f} {pose.y_m:+.2f}"
         where = f"dock of {state.docked_at}" if state.docked_at else where
-        does = Text(f"STOPPED by {state.stopped_by}", style="bold red") if state.stopped else Text(state.job or "idle")
+        stop = f"STOPPED by {state.stopped_by} (stop {state.stop_number})"
+        does = Text(stop, style="bold red") if state.stopped else Text(state.job or "idle")
         tank = "?" if state.tank_ml is None else f"{state.tank_ml:.0f}"
         task = state.queue[0].task_id if state.queue else ""
         waiting = "; ".join(part for part in (state.waiting, *(f"down: {device}" for device in state.down)) if part)

@@ -16,7 +16,7 @@ from core.mesh.chassis import allow, body, create_app, serve_direct
 from core.mesh.metrics import measure
 from core.wire.documents import HistoryEntry
 from core.wire.market import Announcement, Award, Bid
-from core.wire.robot import Job, JobRequest, Position, QueuedTask, RobotState, Stopped, StopRequest
+from core.wire.robot import Job, JobRequest, Position, QueuedTask, ResumeRequest, RobotState, Stopped, StopRequest
 from robot_service.brain import Brain, check_owner, queued
 from robot_service.eye import SHOW_EVERY_S
 from robot_service.failed import SkillFailed
@@ -159,6 +159,8 @@ def _emergency(app: FastAPI, brain: Brain) -> None:
     async def stop(caller: Caller = allow(*ROLES), wish: StopRequest = body(StopRequest)) -> Stopped:
         return await brain.stop(caller, wish.reason)
 
-    @app.post("/resume", summary="Release the e-stop", tags=["safety"])
-    async def resume(caller: Caller = allow("operator")) -> Stopped:
-        return await brain.resume(caller)
+    named = "GET /state tells the stop_number that is latched; send that"
+
+    @app.post("/resume", summary="Release the e-stop that is named", tags=["safety"])
+    async def resume(caller: Caller = allow("operator"), wish: ResumeRequest = body(ResumeRequest, hint=named)) -> Stopped:
+        return await brain.resume(caller, wish.stop_number)

@@ -119,11 +119,11 @@ class BodyLink:
             )
         )
 
-    def order(self, order: Literal["stop", "resume", "rest", "wake"], by: str = "") -> None:
+    def order(self, order: Literal["stop", "resume", "rest", "wake"], by: str = "", stop_number: int = 0) -> None:
         """Send a rare order. Raises LinkDown when there is no body to hear it."""
         if self._link is None:
             raise LinkDown(f"the body cannot be told to {order}: {self.why}")
-        self._send(encode(Control(order=order, by=by)))
+        self._send(encode(Control(order=order, by=by, stop_number=stop_number)))
 
     def rest(self, resting: bool) -> None:
         """Ask for slow readings, or the full rate, once each way."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Callable
 from dataclasses import replace
 
 import httpx
@@ -129,6 +130,7 @@ class Brain:
             tank_ml=None if body is None or body.tank_ml is None else max(0.0, body.tank_ml),
             job="stopped" if stopped and body is not None else activity.job,
             waiting=activity.waiting,
+            stop_number=0 if body is None else body.stop_number,
             stopped=stopped,
             stopped_by="" if body is None else body.stopped_by,
             down=[self.body.down] if self.body.down or body is None else list(body.down),
@@ -316,28 +318,48 @@ class Brain:
         return job
 
     async def stop(self, caller: Caller, reason: str) -> Stopped:
-        """Latch the e-stop in the body; answers once the body has written it down. It stops whatever the answer."""
+        """Latch the e-stop in the body; answers once the body has written it down. It stops whatever the answer.
+
+        Pressed while it is latched it is a stop of its own, which only its own number releases.
+        """
         began_s = self.clock.now()
+        before = self._stop_number()
         # Told again in bids, reports and reasons for waiting, which are sentences of their own.
         self.body.order("stop", f"{caller.subject}: {reason}"[:STOPPED_BY_CHARS] if reason else caller.subject)
-        await self._until(stopped=True)
+        await self._until("stop", lambda: self._stop_number() > before)
         return self._stop_state(began_s)
 
-    async def resume(self, caller: Caller) -> Stopped:
+    async def resume(self, caller: Caller, stop_number: int) -> Stopped:
+        """Release the stop of this number; raises Refused while another one is latched. Released, it stays so."""
         began_s = self.clock.now()
-        self.body.order("resume", caller.subject)
-        await self._until(stopped=False)
+        self._check_stop(stop_number)
+        self.body.order("resume", caller.subject, stop_number)
+        await self._until("resume", lambda: self._released(stop_number))
         self.scheduler.changed()
         return self._stop_state(began_s)
 
-    async def _until(self, *, stopped: bool) -> None:
+    def _stop_number(self) -> int:
+        return 0 if self.body.state is None else self.body.state.stop_number
+
+    def _released(self, stop_number: int) -> bool:
+        """Raises Refused when somebody pressed again meanwhile."""
+        self._check_stop(stop_number)
+        state = self.body.state
+        return state is not None and not state.stopped and state.stop_kept
+
+    def _check_stop(self, stop_number: int) -> None:
+        if (latched := self._stop_number()) not in (0, stop_number):
+            by = "" if self.body.state is None else self.body.state.stopped_by
+            told = f"the robot stands by stop {latched}, not by {stop_number}: {by}"
+            raise Refused(told, hint=f"see why it was stopped, then name stop_number {latched}")
+
+    async def _until(self, order: str, done: Callable[[], bool]) -> None:
         try:
             async with self.clock.timeout(STOP_ANSWER_S):
-                while self.body.state is None or (self.body.state.stopped, self.body.state.stop_kept) != (stopped, True):
+                while not done():
                     await self.clock.sleep(0.02)
         except TimeoutError:
-            order = "stop" if stopped else "resume"
-            held = self.body.state is not None and self.body.state.stopped and stopped
+            held = self.body.state is not None and self.body.state.stopped and order == "stop"
             stands = "; it stands still, but a restart would forget it: look at its disk" if held else ""
             raise Unavailable(f"the body did not confirm the {order} within {STOP_ANSWER_S:g} s{stands}") from None
 
@@ -347,6 +369,7 @@ class Brain:
             robot_id=self.settings.id,
             stopped=state is None or state.stopped,
             by="" if state is None else state.stopped_by,
+            stop_number=self._stop_number(),
             after_s=max(0.0, self.clock.now() - began_s),
         )
 

@@ -15,19 +15,23 @@ DEPTH_MAX = 32
 _READS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
-def body(model: type[M]) -> Any:
-    """`request: WaterRequest = body(WaterRequest)` in an endpoint: the body, checked strictly."""
-    return Depends(Reader(model))
+def body(model: type[M], hint: str = "") -> Any:
+    """`request: WaterRequest = body(WaterRequest)` in an endpoint: the body, checked strictly.
+
+    `hint` is for a document whose fields everybody must know of: no body at all then lacks them, as {} does.
+    """
+    return Depends(Reader(model, hint))
 
 
 class Reader:
     """The dependency behind `body`; `create_app` finds it to describe the body in the OpenAPI document."""
 
-    def __init__(self, model: type[BaseModel]) -> None:
-        self.model = model
+    def __init__(self, model: type[BaseModel], hint: str = "") -> None:
+        self.model, self._hint = model, hint
 
     async def __call__(self, request: Request) -> Any:
-        return parse(self.model, await request.body())
+        raw = await request.body()
+        return parse(self.model, raw or (b"{}" if self._hint else b""), self._hint)
 
 
 def raw(media_type: str) -> Any:
@@ -47,13 +51,13 @@ class RawReader:
         return await request.body()
 
 
-def parse(model: type[M], raw: bytes) -> M:
+def parse(model: type[M], raw: bytes, hint: str = "") -> M:
     """One document from bytes; raises BadRequest for what is not JSON, Unprocessable for what is not this document."""
     _check_json(raw)
     try:
         return model.model_validate_json(raw, strict=True)
     except ValidationError as error:
-        raise Unprocessable(_told(error), hint=f"a {model.__name__} as in /openapi.json") from error
+        raise Unprocessable(_told(error), hint=hint or f"a {model.__name__} as in /openapi.json") from error
 
 
 def _told(error: ValidationError) -> str:

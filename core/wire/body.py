@@ -55,6 +55,8 @@ class Control(_Line, frozen=True, kw_only=True, tag="control"):
 
     order: Literal["stop", "resume", "rest", "wake"]
     by: str = ""
+    stop_number: int = 0
+    """Which stop `resume` releases: it does nothing to any other."""
 
 
 class Marker(_Line, frozen=True, kw_only=True, tag=False, tag_field=None):
@@ -112,6 +114,8 @@ class BodyState(_Line, frozen=True, kw_only=True, tag="state"):
     stopped_by: str = ""
     stop_kept: bool = True
     """That it is latched, or is not, is written down and survives a restart."""
+    stop_number: int = 0
+    """Names the stop that is latched and written down; 0 while there is none. No number comes twice."""
     refusal: str = ""
     """Why the gate refused the newest setpoint, or parts of it; empty when all was allowed."""
     down: tuple[str, ...] = ()

@@ -11,6 +11,8 @@ from core.wire.geometry import Point2, Pose2
 from core.wire.market import Breakdown, TaskKind
 
 JobKind = Literal["goto", "dock", "undock", "home"]
+StopNumber = Annotated[int, Field(ge=0, le=2**53)]
+"""Every `POST /stop` takes the next one, for as long as the robot's body has its files."""
 
 
 class Position(Document):
@@ -55,6 +57,8 @@ class RobotState(Document):
     """The one-line reason for waiting; empty when it does not wait."""
     stopped: bool
     stopped_by: str = ""
+    stop_number: StopNumber = 0
+    """Names the stop that `POST /resume` releases; 0 while it is not stopped, or the stop is not written down yet."""
     down: list[str] = []
     queue: list[QueuedTask] = []
     route: list[Point2] = []
@@ -87,8 +91,26 @@ class StopRequest(Document):
     reason: Sentence = ""
 
 
+class ResumeRequest(Document):
+    """`POST /resume`: releases the stop that the operator saw, and no later one."""
+
+    stop_number: Annotated[StopNumber, Field(ge=1)]
+
+
+class NamedStop(ResumeRequest):
+    robot_id: Identifier
+
+
+class ResumeAllRequest(Document):
+    """`POST /api/resume` at the console: each robot's stop as the page showed it; other robots stay as they are."""
+
+    stops: Annotated[list[NamedStop], Field(min_length=1, max_length=1000)]
+
+
 class Stopped(Document):
     robot_id: Identifier
     stopped: bool
     by: str = ""
+    stop_number: StopNumber = 0
+    """What `POST /resume` must name; 0 when it goes on."""
     after_s: Seconds = 0.0

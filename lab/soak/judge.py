@@ -30,6 +30,8 @@ class Judge:
         self.papers = Papers(case, self.awards.read)
         self._stops: set[str] = set()
         """E-stops that were confirmed: the same question gets the same answer again, also after a release."""
+        self._stop_numbers: dict[str, int] = {}
+        """The newest one confirmed of each robot: a release that names an older one must release nothing."""
 
     @property
     def breaches(self) -> list[Breach]:
@@ -76,8 +78,12 @@ class Judge:
             return
         if message.path == "/tasks" and message.target.startswith("robot"):
             self.awards.awarded(message)
-        elif message.path == "/resume":
+        elif message.path == "/resume" and self._newest(message):
             self._case.stopped.discard(message.target)
+
+    def _newest(self, release: Message) -> bool:
+        """Whether it names the newest stop that was confirmed, or one that came after."""
+        return bool(json.loads(release.body)["stop_number"] >= self._stop_numbers.get(release.target, 0))
 
     def _answered(self, message: Message, answer: Answer) -> None:
         """What left a node."""
@@ -90,6 +96,7 @@ class Judge:
         if message.path == "/stop" and message.key not in self._stops:
             self._stops.add(message.key)
             self._case.stopped.add(message.target)
+            self._stop_numbers[message.target] = json.loads(answer.body)["stop_number"]
         if message.target.startswith("plant"):
             self.papers.look(message.target)
             self.papers.answered(message, answer)

@@ -183,6 +183,8 @@ class People:
         self._garden, self._judge, self._gremlin, self._rng, self._hurry = garden, judge, gremlin, rng, hurry
         self._life, self._number = Life("operator"), 0
         self._transport = garden.mesh.transport(self._life)
+        self._releases: dict[str, dict[str, object]] = {}
+        """The newest release of each robot: somebody heard it on the network and says it again after the next stop."""
 
     async def run(self) -> None:
         while True:
@@ -209,16 +211,27 @@ class People:
         robot_id = self._rng.choice(self._garden.names("robot"))
         self._gremlin.strike("estop", robot_id)
         await self._call(robot_id, "POST", "/stop", {"reason": "a child runs in"})
+        if (wish := self._releases.get(robot_id)) is not None:
+            await self._call(robot_id, "POST", "/resume", wish)
         await asyncio.sleep(self._rng.uniform(5.0, 240.0))
         await self._resume(robot_id)
 
     async def _resume(self, robot_id: str) -> None:
         for _ in range(20):
             self._gremlin.touch(robot_id)
-            answer = await self._call(robot_id, "POST", "/resume")
-            if answer is not None and answer.status < 300:
-                return
+            state = await self._call(robot_id, "GET", "/state")
+            if state is not None and state.status < 300:
+                told = json.loads(state.body)
+                if not told["stopped"]:
+                    return
+                if told["stop_number"] and await self._release(robot_id, told["stop_number"]):
+                    return
             await asyncio.sleep(15.0)
+
+    async def _release(self, robot_id: str, stop_number: int) -> bool:
+        wish = self._releases[robot_id] = {"stop_number": stop_number}
+        answer = await self._call(robot_id, "POST", "/resume", wish)
+        return answer is not None and answer.status < 300
 
     async def mend(self) -> None:
         for robot_id in self._garden.names("robot"):

@@ -167,6 +167,7 @@ class BodyNode:
             stopped=self.latch.stopped,
             stopped_by=self.latch.by,
             stop_kept=self.latch.kept,
+            stop_number=self.latch.number,
             refusal="" if waking else self._verdict.refusal,
             next_in_s=self._next_in_s(),
         )
@@ -248,14 +249,17 @@ class BodyNode:
         while True:
             control = await self._orders.get()
             try:
-                if control.order == "stop":
-                    await self.latch.keep()
-                else:
-                    await self.latch.release()
-                _log.warning("e-stop", order=control.order, by=control.by)
+                done = await self._latch(control)
+                _log.warning("e-stop", order=control.order, by=control.by, number=control.stop_number, done=done)
             except StorageError as error:
                 _log.error("the stop latch is not durable", why=str(error))
             self._wake()
+
+    async def _latch(self, control: Control) -> bool:
+        if control.order == "resume":
+            return await self.latch.release(control.stop_number)
+        await self.latch.keep()
+        return True
 
 
 async def _run(loop: Loop) -> None:

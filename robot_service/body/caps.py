@@ -50,6 +50,7 @@ class _Stop(BaseModel):
 
     stopped: bool
     by: str
+    number: Annotated[int, Field(ge=0)] = 0
 
 
 class Ledger:
@@ -113,11 +114,15 @@ class Ledger:
 
 
 class StopLatch:
-    """The e-stop. It latches at once; that it did is durable a moment later. It is released only when that is durable."""
+    """The e-stop. It latches at once; that it did is durable a moment later. It is released only when that is durable.
+
+    Every press takes the next number, and a release names the press it means: a word of yesterday, said again, does not
+    release what somebody pressed today.
+    """
 
     def __init__(self, folder: Path, clock: Clock, disk: Disk | None = None) -> None:
         self._document = DurableDocument(folder / "stop.json", STOP_SCHEMA, clock, disk)
-        self._presses = 0
+        self._number = 0
         self.stopped = True
         self.by = "not started yet"
         self.kept = False
@@ -131,24 +136,39 @@ class StopLatch:
         except ValidationError as error:
             raise StorageError(f"{self._document.path} is no stop latch: {error}") from error
         self.stopped, self.by, self.kept = stop.stopped, stop.by, True
+        self._number = max(stop.number, int(stop.stopped))
+
+    @property
+    def number(self) -> int:
+        """Of the press that is latched and written down; 0 while there is none.
+
+        A number that a crash could take back is not told: nobody may ever hear of two presses by one name.
+        """
+        return self._number if self.stopped and self.kept else 0
 
     def close(self) -> None:
         self._document.close()
 
     def press(self, by: str) -> None:
-        """Stop now, whatever happens to the disk."""
-        self._presses += 1
+        """Stop now, whatever happens to the disk. Pressed again it is another stop."""
+        self._number += 1
         self.stopped, self.by, self.kept = True, by or "somebody", False
 
     async def keep(self) -> None:
         """Write down that it is latched. Raises StorageError; then it stands, and would not survive a restart."""
-        presses = self._presses
-        await self._document.save({"stopped": True, "by": self.by})
-        self.kept = self.stopped and presses == self._presses
+        number = self._number
+        await self._document.save({"stopped": True, "by": self.by, "number": number})
+        self.kept = self.stopped and number == self._number
 
-    async def release(self) -> None:
-        """Raises StorageError and stays latched when it cannot be made durable."""
-        presses = self._presses
-        await self._document.save({"stopped": False, "by": ""})
-        if presses == self._presses:
-            self.stopped, self.by, self.kept = False, "", True
+    async def release(self, number: int) -> bool:
+        """False, and nothing changes, when `number` is not the stop that is latched.
+
+        Raises StorageError and stays latched when it cannot be made durable.
+        """
+        if not self.stopped or number != self._number:
+            return False
+        await self._document.save({"stopped": False, "by": "", "number": number})
+        if number != self._number:
+            return False
+        self.stopped, self.by, self.kept = False, "", True
+        return True

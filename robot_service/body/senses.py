@@ -153,6 +153,7 @@ class Senses:
         stopped: bool,
         stopped_by: str,
         stop_kept: bool,
+        stop_number: int,
         refusal: str,
         next_in_s: float,
     ) -> BodyState:
@@ -191,6 +192,7 @@ class Senses:
             stopped=stopped,
             stopped_by=stopped_by,
             stop_kept=stop_kept,
+            stop_number=stop_number,
             refusal=refusal,
             down=self.down(),
             next_in_s=next_in_s,

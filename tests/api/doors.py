@@ -142,7 +142,7 @@ class Doors:
             return {name: state[name] for name in ("settings", "open_tasks", "watered_today_ml", "dock_holder", "thirsty")}
         if path == "/stopped-of-state":
             state = self._read(kind, "/state")
-            return {name: state[name] for name in ("stopped", "stopped_by", "queue", "down")}
+            return {name: state[name] for name in ("stopped", "stopped_by", "stop_number", "queue", "down")}
         if path == "/clock":
             return {name: self._read(kind, path)[name] for name in ("speed", "paused")}
         document = self._read(kind, path)

@@ -76,9 +76,11 @@ GOOD: dict[tuple[str, str, str], dict[str, Any]] = {
     ("robot", "POST", "/tasks"): {"announcement": ANNOUNCED, "epoch": 1, "lease_s": 8.0, "cost_s": 20.0, "at_most_s": 500.0},
     ("robot", "POST", "/jobs"): {"kind": "goto", "x_m": -1.5, "y_m": 0.4, "yaw_rad": 1.0, "at": ""},
     ("robot", "POST", "/stop"): {"reason": "a test"},
+    ("robot", "POST", "/resume"): {"stop_number": 7},
     ("sim", "PATCH", "/clock"): {"speed": 3.0, "paused": False},
     ("sim", "POST", "/faults"): {"kind": "wheel_slip", "target": "robot-1", "duration_s": 1.0, "strength": 2.0},
     ("console", "POST", "/api/stop"): {"reason": "a test"},
+    ("console", "POST", "/api/resume"): {"stops": [{"robot_id": "robot-1", "stop_number": 7}]},
     ("console", "POST", "/orders"): {"count": 3, "plant_id": "", "within_s": 60.0, "priority": 5},
     ("console", "POST", "/api/plants/{plant_id}/water"): TASK,
 }  # fmt: skip

@@ -19,7 +19,7 @@ from console.service import build
 from console.snapshot import Snapshot
 from core import scenario as scenarios
 from core.clock import WallClock
-from core.errors import GardenError, NotFound
+from core.errors import GardenError, NotFound, Refused
 from core.mesh.auth import Caller, Identity, Verifier
 from core.mesh.chassis import allow, body, create_app
 from core.mesh.client import HttpxTransport
@@ -30,7 +30,7 @@ from core.wire.documents import NodeCard
 from core.wire.geometry import Point3, Pose2
 from core.wire.market import Bid, BidRound, Breakdown, PlantCard, Task, TaskEvent, TaskRequest
 from core.wire.plant import PlantState, Settings, SoilReading
-from core.wire.robot import Job, JobRequest, RobotState, Stopped, StopRequest
+from core.wire.robot import Job, JobRequest, ResumeRequest, RobotState, Stopped, StopRequest
 
 ORIGIN = Point3(x_m=0.0, y_m=0.0, z_m=0.0)
 POSE = Pose2(x_m=0.5, y_m=-0.25, yaw_rad=0.0)
@@ -93,20 +93,26 @@ def pot(name: str, verifier: Verifier) -> FastAPI:
 
 def robot(name: str, verifier: Verifier) -> FastAPI:
     app = app_of(name, "robot", verifier)
-    app.state.stopped, app.state.job = False, None
+    app.state.stopped, app.state.stop_number, app.state.job = False, 0, None
 
     @app.get("/state")
     async def told() -> RobotState:
-        stopped = app.state.stopped
-        return RobotState(robot_id=name, now_s=1.0, pose=POSE, battery_ratio=0.9, tank_ml=1000.0, stopped=stopped)
+        stopped, number = app.state.stopped, app.state.stop_number
+        return RobotState(
+            robot_id=name, now_s=1.0, pose=POSE, battery_ratio=0.9, tank_ml=1000.0, stopped=stopped,
+            stop_number=number if stopped else 0,
+        )  # fmt: skip
 
     @app.post("/stop")
     async def stop(request: StopRequest = body(StopRequest), caller: Caller = allow("operator", "viewer")) -> Stopped:
         app.state.stopped = True
-        return Stopped(robot_id=name, stopped=True, by=caller.subject)
+        app.state.stop_number += 1
+        return Stopped(robot_id=name, stopped=True, by=caller.subject, stop_number=app.state.stop_number)
 
     @app.post("/resume")
-    async def resume(caller: Caller = allow("operator")) -> Stopped:
+    async def resume(request: ResumeRequest = body(ResumeRequest), caller: Caller = allow("operator")) -> Stopped:
+        if request.stop_number != app.state.stop_number:
+            raise Refused(f"stop {app.state.stop_number} is latched")
         app.state.stopped = False
         return Stopped(robot_id=name, stopped=False)
 
@@ -241,13 +247,25 @@ def test_stop_stops_all_and_resume_needs_the_operator(street: Street, tmp_path: 
     assert "STOPPED" in garden(tmp_path, "robots").stdout
     assert [one["robot_id"] for one in asked(tmp_path, "resume", "robot-2")] == ["robot-2"]
     assert [one["stopped"] for one in asked(tmp_path, "robots")] == [True, False]
+    assert [one["robot_id"] for one in asked(tmp_path, "resume")] == ["robot-1", "robot-2"]
+    assert [one["stopped"] for one in asked(tmp_path, "robots")] == [False, False]
+
+
+def test_resume_releases_the_stop_that_is_named(street: Street, tmp_path: Path) -> None:
+    for _ in range(2):
+        asked(tmp_path, "stop", "robot-1")
+    assert "(stop 2)" in garden(tmp_path, "stop", "robot-2").stdout.replace("(stop 1)", "(stop 2)")
+    assert "stop 2 is latched" in str(refused(tmp_path, "resume", "robot-1", "--stop", "1"))
+    assert "ROBOT --stop" in refused(tmp_path, "resume", "--stop", "2").hint
+    assert street.apps[8201].state.stopped
+    assert [one["stopped"] for one in asked(tmp_path, "resume", "robot-1", "--stop", "2")] == [False]
 
 
 def test_stop_reaches_the_others_when_one_does_not_answer(street: Street, tmp_path: Path) -> None:
     dead = street.apps.pop(8201)
     result = garden(tmp_path, "stop")
     assert isinstance(result.exception, GardenError)
-    assert "robot-1 did NOT answer" in result.stderr
+    assert "robot-1 did NOT stop" in result.stderr
     assert street.apps[8202].state.stopped is True
     assert dead.state.stopped is False
 
@@ -308,8 +326,18 @@ def test_the_console_shows_and_stops_with_the_callers_own_token(console: httpx.A
             assert (await console.post("/api/stop", json={})).status_code == 401
             stopped = await console.post("/api/stop", json={"reason": "test"}, headers=bearer("viewer"))
             assert [one["by"] for one in stopped.json()["robots"]] == ["viewer", "viewer"]
-            assert (await console.post("/api/resume", headers=bearer("viewer"))).status_code == 403
-            assert (await console.post("/api/resume", headers=bearer("operator"))).json()["errors"] == {}
+            shown = [{"robot_id": one["robot_id"], "stop_number": one["stop_number"]} for one in stopped.json()["robots"]]
+            release = {"stops": shown}
+            assert (await console.post("/api/resume", json=release, headers=bearer("viewer"))).status_code == 403
+            nameless = await console.post("/api/resume", headers=bearer("operator"))
+            assert (nameless.status_code, "stop_number" in nameless.json()["hint"]) == (422, True)
+            await console.post("/api/stop", json={}, headers=bearer("viewer"))
+            late = (await console.post("/api/resume", json=release, headers=bearer("operator"))).json()
+            assert late["errors"] == dict.fromkeys(("robot-1", "robot-2"), "stop 2 is latched")
+            again = {"stops": [{"robot_id": name, "stop_number": 2} for name in ("robot-1", "robot-2", "robot-9")]}
+            done = (await console.post("/api/resume", json=again, headers=bearer("operator"))).json()
+            assert [one["stopped"] for one in done["robots"]] == [False, False]
+            assert list(done["errors"]) == ["robot-9"]
             task = await console.post("/api/plants/plant-2/water", json={"kind": "water"}, headers=bearer("operator"))
             assert (task.json()["plant_id"], task.json()["asked_by"]) == ("plant-2", "operator")
             assert (await console.get("/overview.jpg")).status_code == 502

@@ -97,7 +97,7 @@ def test_an_e_stop_stops_at_once_latches_through_restarts_and_ends_only_by_resum
         assert "a cat" in state["stopped_by"]
         assert "stopped by" in (await garden.get("plant-1", "/state"))["waiting"]
         assert story.stands(story.robot(garden))
-        assert (await garden.post("robot-1", "/resume", {})).status_code == 200
+        assert (await garden.post("robot-1", "/resume", {"stop_number": state["stop_number"]})).status_code == 200
         await story.served(garden, "plant-1")
         story.unhurt(garden)
 
@@ -107,12 +107,12 @@ def test_an_e_stop_stops_at_once_latches_through_restarts_and_ends_only_by_resum
 def test_a_stop_while_it_pumps_is_the_end_of_that_dose():
     async def told(garden):
         await story.when(garden, lambda: story.robot(garden).pumped_ml > 30.0)
-        await garden.post("robot-1", "/stop", {})
+        stopped = (await garden.post("robot-1", "/stop", {})).json()
         await story.stops(garden)
         poured_ml = garden.truth().plant("plant-1").poured_ml
         await garden.clock.sleep(5.0)
         assert garden.truth().plant("plant-1").poured_ml == poured_ml < 45.0
-        await garden.post("robot-1", "/resume", {})
+        await garden.post("robot-1", "/resume", {"stop_number": stopped["stop_number"]})
         task = await story.served(garden, "plant-1", 400.0)
         assert garden.truth().plant("plant-1").poured_ml <= story.allowed_ml(task)
         story.unhurt(garden)

@@ -301,3 +301,15 @@ def an_estop_is_confirmed_before_it_is_written_down():
 
     with mock.patch.object(StopLatch, "press", press):
         yield
+
+
+@bug
+def a_release_said_again_releases_a_later_stop():
+    """Neither brain nor body looks at which stop is meant."""
+    real = StopLatch.release
+
+    async def release(self, number):
+        return await real(self, self._number)
+
+    with mock.patch.object(StopLatch, "release", release), mock.patch.object(Brain, "_check_stop"):
+        yield

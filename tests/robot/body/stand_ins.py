@@ -136,8 +136,8 @@ class Brain:
     def hello(self, secret: str = SECRET) -> None:
         self.link.write(encode(Hello(secret=secret)))
 
-    def order(self, order: Any, by: str = "test") -> None:
-        self.link.write(encode(Control(order=order, by=by)))
+    def order(self, order: Any, by: str = "test", stop_number: int = 0) -> None:
+        self.link.write(encode(Control(order=order, by=by, stop_number=stop_number)))
 
     async def listen(self) -> None:
         lines = LineBuffer()

@@ -232,21 +232,48 @@ def test_the_e_stop_stops_latches_and_survives_a_restart(tmp_path: Path) -> None
         await rig.clock.sleep(0.5)
         assert (brain.state.stopped, brain.state.stopped_by) == (True, "operator anna")
         assert brain.state.refusal == "stopped by operator anna"
+        assert brain.state.stop_number == 1
 
     async def release(rig: Any) -> None:
         brain = await rig.brain()
         brain.wish = DRIVE
         await rig.clock.sleep(0.5)
         assert rig.base.doing == ("stop",)
-        assert brain.state.stopped
-        brain.order("resume", "operator anna")
+        assert (brain.state.stopped, brain.state.stop_number) == (True, 1)
+        brain.order("resume", "operator anna", 1)
         await rig.until(lambda: rig.base.doing[0] == "drive")
+        assert brain.state.stop_number == 0
 
     async def moves(rig: Any) -> None:
         (await rig.brain()).wish = DRIVE
         await rig.until(lambda: rig.base.doing[0] == "drive")
 
     for part in (press, release, moves):
+        story(tmp_path, part)
+
+
+def test_a_release_of_an_earlier_stop_releases_no_later_one(tmp_path: Path) -> None:
+    async def press(rig: Any) -> None:
+        brain = await rig.brain()
+        brain.order("stop", "anna")
+        await rig.until(lambda: brain.state.stop_number == 1)
+        brain.order("resume", "anna", 1)
+        await rig.until(lambda: not brain.state.stopped)
+
+    async def say_it_again(rig: Any) -> None:
+        brain = await rig.brain()
+        brain.wish = DRIVE
+        for number in (2, 3):
+            brain.order("stop", "a child")
+            await rig.until(lambda number=number: brain.state.stop_number == number)
+        for older in (0, 1, 2, 4):
+            brain.order("resume", "anna", older)
+        await rig.clock.sleep(1.0)
+        assert (rig.base.doing, brain.state.stopped, brain.state.stop_number) == (("stop",), True, 3)
+        brain.order("resume", "anna", 3)
+        await rig.until(lambda: rig.base.doing[0] == "drive")
+
+    for part in (press, say_it_again):
         story(tmp_path, part)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 from pathlib import Path
@@ -10,8 +11,9 @@ import pytest
 
 from core.clock import VirtualClock
 from core.errors import StorageError
+from core.store import DurableDocument
 from core.virtual import run_virtual
-from robot_service.body.caps import Caps, Ledger, StopLatch
+from robot_service.body.caps import STOP_SCHEMA, Caps, Ledger, StopLatch
 
 ROOT = Path(__file__).parents[3]
 CAPS = Caps(command_ml=100.0, hour_ml=150.0, day_ml=250.0)
@@ -114,14 +116,72 @@ def test_the_latch_acts_although_the_disk_does_not(tmp_path: Path) -> None:
         latch.press("anna")
         await latch.keep()
         assert latch.kept
-        await latch.release()
+        assert await latch.release(latch.number)
         latch.close()
         latch.press("anna")
         with pytest.raises(StorageError):
             await latch.keep()
         assert (latch.stopped, latch.by, latch.kept) == (True, "anna", False)
+        assert latch.number == 0, "a crash would take the number back"
         with pytest.raises(StorageError):
-            await latch.release()
+            await latch.release(2)
         assert latch.stopped
+
+    run_virtual(main())
+
+
+def test_every_press_has_a_number_of_its_own_over_restarts_and_only_that_releases_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        for number in range(1, 6):
+            latch = StopLatch(tmp_path, VirtualClock())
+            latch.load()
+            latch.press("anna")
+            assert latch.number == 0
+            await latch.keep()
+            assert latch.number == number
+            for other in (0, number - 1, number + 1):
+                assert not await latch.release(other)
+            assert (latch.stopped, latch.number) == (True, number)
+            if number % 2:
+                assert await latch.release(number)
+                assert (latch.stopped, latch.number) == (False, 0)
+                assert not await latch.release(number), "nothing is latched"
+            latch.close()
+
+    run_virtual(main())
+
+
+def test_a_press_while_a_release_is_written_down_stays_latched(tmp_path: Path) -> None:
+    async def main() -> None:
+        latch = StopLatch(tmp_path, VirtualClock())
+        latch.load()
+        latch.press("anna")
+        await latch.keep()
+        releasing = asyncio.ensure_future(latch.release(1))
+        await asyncio.sleep(0)
+        latch.press("a child")
+        assert not await releasing
+        await latch.keep()
+        assert (latch.stopped, latch.by, latch.number) == (True, "a child", 2)
+        latch.close()
+        again = StopLatch(tmp_path, VirtualClock())
+        again.load()
+        assert (again.stopped, again.by, again.number) == (True, "a child", 2)
+        again.close()
+
+    run_virtual(main())
+
+
+def test_a_latch_written_by_an_earlier_version_can_be_released(tmp_path: Path) -> None:
+    async def main() -> None:
+        document = DurableDocument(tmp_path / "stop.json", STOP_SCHEMA, VirtualClock())
+        document.load()
+        await document.save({"stopped": True, "by": "anna"})
+        document.close()
+        latch = StopLatch(tmp_path, VirtualClock())
+        latch.load()
+        assert (latch.stopped, latch.number) == (True, 1)
+        assert await latch.release(1)
+        latch.close()
 
     run_virtual(main())

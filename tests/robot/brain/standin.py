@@ -97,7 +97,7 @@ class StandInBody:
         self.travel_scale, self.noise_m = 1.03, 0.006
         self.battery_ratio, self.tank_ml = 0.9, 1200.0
         self.stopped, self.stopped_by, self.blind, self.pump_stuck = False, "", False, False
-        self.disk_broken = False
+        self.disk_broken, self.stop_number = False, 0
         self.attracted_to = ""
         """A dock whose beams drown the others."""
         self.arm: Joints | None = None
@@ -144,7 +144,8 @@ class StandInBody:
         elif isinstance(message, Control):
             if message.order == "stop":
                 self.stopped, self.stopped_by = True, message.by
-            elif message.order == "resume":
+                self.stop_number += 1
+            elif message.order == "resume" and message.stop_number == self.stop_number:
                 self.stopped, self.stopped_by = False, ""
             elif message.order == "wake":
                 self._active_s = self.clock.now()
@@ -309,6 +310,7 @@ class StandInBody:
             stopped=self.stopped,
             stopped_by=self.stopped_by,
             stop_kept=not self.disk_broken,
+            stop_number=self.stop_number if self.stopped and not self.disk_broken else 0,
         )
         try:
             self.link.write(encode(state))
@@ -512,7 +514,9 @@ class Garden:
         answer = await self.call(robot, "POST", "/bids", self.plants[plant].announcement(99, dose_ml), as_=plant)
         return Bid.model_validate_json(answer.content)
 
-    async def call(self, to: str, method: str, path: str, document: object = None, as_: str = "operator"):  # type: ignore[no-untyped-def]
+    async def call(  # type: ignore[no-untyped-def]
+        self, to: str, method: str, path: str, document: object = None, as_: str = "operator", key: str = ""
+    ):
         import httpx
 
         role = "plant" if as_.startswith("plant") else "robot" if as_.startswith("robot") else as_
@@ -520,6 +524,7 @@ class Garden:
         async with httpx.AsyncClient(transport=self.mesh.transport(as_), base_url=f"http://{to}") as client:
             content = None if document is None else document.model_dump_json()  # type: ignore[attr-defined]
             headers = {"authorization": f"Bearer {token}", "content-type": "application/json"}
+            headers |= {"idempotency-key": key} if key else {}
             return await client.request(method, path, content=content, headers=headers, timeout=30.0)
 
 

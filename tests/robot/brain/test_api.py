@@ -3,7 +3,8 @@
 import pytest
 from standin import in_garden
 
-from core.wire.robot import JobRequest, StopRequest
+from core.wire.documents import Document
+from core.wire.robot import JobRequest, ResumeRequest, StopRequest
 
 
 def asked(story):
@@ -85,6 +86,62 @@ def test_an_e_stop_that_the_body_cannot_write_down_stands_and_is_not_confirmed()
         assert answer.status_code == 503
         assert "a restart would forget it" in answer.json()["detail"]
         assert (await garden.call("robot-1", "GET", "/state")).json()["stopped"]
+
+    asked(story)
+
+
+def test_a_captured_release_does_not_end_a_later_stop():
+    async def story(garden):
+        async def press():
+            answer = await garden.call("robot-1", "POST", "/stop", StopRequest(reason="cat"), as_="viewer")
+            return answer.json()["stop_number"]
+
+        async def release(number, **more):
+            return await garden.call("robot-1", "POST", "/resume", ResumeRequest(stop_number=number), **more)
+
+        first = await press()
+        assert (await garden.call("robot-1", "GET", "/state")).json()["stop_number"] == first
+        assert (await release(first, key="k1")).json() | {"after_s": 0.0} == {
+            "robot_id": "robot-1", "stopped": False, "by": "", "stop_number": 0, "after_s": 0.0,
+        }  # fmt: skip
+        assert (await garden.call("robot-1", "GET", "/state")).json()["stop_number"] == 0
+        assert (await release(first)).status_code == 200, "said again it is still so"
+        await garden.clock.sleep(601.0)
+        second = await press()
+        assert second > first
+        for more in ({"key": "k1"}, {"key": "k2"}, {}):
+            answer = await release(first, **more)
+            assert answer.status_code == 409
+            assert str(second) in answer.json()["hint"]
+        assert garden.bodies["robot-1"].stopped
+        assert (await release(second, key="k1")).json()["stopped"] is False
+
+    asked(story)
+
+
+def test_a_second_stop_while_it_stands_is_another_stop():
+    async def story(garden):
+        for reason in ("cat", "dog"):
+            answer = await garden.call("robot-1", "POST", "/stop", StopRequest(reason=reason), as_="viewer")
+        told = answer.json()
+        assert (told["by"], told["stop_number"]) == ("viewer: dog", 2)
+        refused = await garden.call("robot-1", "POST", "/resume", ResumeRequest(stop_number=1))
+        assert (refused.status_code, "viewer: dog" in refused.json()["detail"]) == (409, True)
+        assert (await garden.call("robot-1", "POST", "/resume", ResumeRequest(stop_number=2))).status_code == 200
+        assert not garden.bodies["robot-1"].stopped
+
+    asked(story)
+
+
+def test_a_release_that_names_no_stop_is_422_and_told_where_the_number_stands():
+    async def story(garden):
+        await garden.call("robot-1", "POST", "/stop", StopRequest(), as_="viewer")
+        for nothing in (None, Document()):
+            answer = await garden.call("robot-1", "POST", "/resume", nothing)
+            assert answer.status_code == 422
+            assert "stop_number" in answer.json()["detail"]
+            assert "GET /state" in answer.json()["hint"]
+        assert garden.bodies["robot-1"].stopped
 
     asked(story)
 

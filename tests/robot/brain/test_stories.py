@@ -7,7 +7,7 @@ from core.allocation.bidding import done_s
 from core.geometry.planar import distance_m
 from core.robots import gardener
 from core.wire.market import ReservationRequest
-from core.wire.robot import JobRequest, StopRequest
+from core.wire.robot import JobRequest, ResumeRequest, StopRequest
 
 
 def poured(garden, plant, robot="robot-1"):
@@ -326,9 +326,10 @@ def test_the_e_stop_halts_the_wheels_latches_and_gives_the_task_back():
         await garden.until(lambda: plant.ended, 5.0)
         assert "stopped by viewer: cat" in plant.ended.reason
         assert (await garden.bid("plant-3")).reason.startswith("stopped by")
-        assert (await garden.call("robot-1", "POST", "/resume", as_="viewer")).status_code == 403
+        release = ResumeRequest(stop_number=answer.json()["stop_number"])
+        assert (await garden.call("robot-1", "POST", "/resume", release, as_="viewer")).status_code == 403
         assert body.stopped
-        assert (await garden.call("robot-1", "POST", "/resume", as_="operator")).json()["stopped"] is False
+        assert (await garden.call("robot-1", "POST", "/resume", release, as_="operator")).json()["stopped"] is False
         await garden.award("plant-3", number=2)
         await garden.until(lambda: plant.reports[-1].state == "done", 150.0)
 
