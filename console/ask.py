@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import secrets
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -188,7 +189,7 @@ def water(plant: str, ml: float | None, within_s: float | None, priority: int, d
     request = _request(TaskRequest, kind="water", dose_ml=ml, within_s=within_s, priority=priority)
 
     async def ask(line: Line) -> Task:
-        return await line.mesh.call(line.peer(plant, "plant"), "POST", "/tasks", request, expect=Task)
+        return await line.mesh.call(line.peer(plant, "plant"), "POST", "/tasks", request, expect=Task, key=_key())
 
     task = _run(data, "operator", ask)
     _show(task, as_json, lambda: f"{task.task_id}: {plant} asks for {task.dose_ml:g} ml; `garden tasks {task.task_id}`")
@@ -246,9 +247,14 @@ def cancel(name: str, data: Path, as_json: bool) -> None:
 
 def _sender(line: Line) -> Send:
     async def send(pot: Peer, request: TaskRequest) -> Task:
-        return await line.mesh.call(pot, "POST", "/tasks", request, expect=Task)
+        return await line.mesh.call(pot, "POST", "/tasks", request, expect=Task, key=_key())
 
     return send
+
+
+def _key() -> str:
+    """A new Idempotency-Key: what was recorded on the way is, said again, the same request and not another one."""
+    return secrets.token_hex(16)
 
 
 async def _order(line: Line, wish: OrderRequest, pots: list[Peer]) -> Order:
@@ -339,7 +345,7 @@ def job(robot: str, kind: JobKind, where: str, wait: bool, data: Path, as_json: 
 def _send_job(robot: str, request: JobRequest, wait: bool, data: Path, as_json: bool) -> None:
     async def send(line: Line) -> Job:
         peer = line.peer(robot, "robot")
-        sent = await line.mesh.call(peer, "POST", "/jobs", request, expect=Job)
+        sent = await line.mesh.call(peer, "POST", "/jobs", request, expect=Job, key=_key())
         while wait and sent.state in ("queued", "running"):
             await asyncio.sleep(POLL_S)
             sent = await line.mesh.call(peer, "GET", f"/jobs/{sent.job_id}", expect=Job)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
+from hashlib import sha256
 from pathlib import Path as FilePath
 from typing import Annotated, TypeVar
 
@@ -34,6 +35,7 @@ FRESH_S = 0.5
 PAGE = FilePath(__file__).with_name("page.html")
 Name = Annotated[str, Path(max_length=80)]
 Token = Annotated[str, Header(alias="authorization", max_length=5000)]
+Key = Annotated[str, Header(alias="idempotency-key", max_length=128)]
 
 
 class Answers(Document):
@@ -140,12 +142,13 @@ def _add_buttons(app: FastAPI, mesh: Mesh, peers: Peers) -> None:
         authorization: Token = "",
         caller: Caller = allow("operator"),
         request: TaskRequest = body(TaskRequest),
+        idempotency_key: Key = "",
     ) -> Task:
         pots = peers.of_kind("plant")
         if (pot := next((pot for pot in pots if pot.id == plant_id), None)) is None:
             raise NotFound(f"no plant {plant_id!r}", hint=f"known: {', '.join(pot.id for pot in pots) or 'none'}")
         content = request.model_dump_json().encode()
-        return await _pass_on(mesh, pot, "/tasks", content, authorization, Task)
+        return await _pass_on(mesh, pot, "/tasks", content, authorization, Task, key=idempotency_key)
 
 
 def _robot(peers: Peers, name: str) -> Peer:
@@ -164,8 +167,11 @@ class Counter:
         self._orders: dict[str, Order] = {}
         self._taken = 0
 
-    async def take(self, wish: OrderRequest, by: str, token: str) -> Order:
-        """Raises NotFound for an unknown plant, Refused when nothing ripe is known."""
+    async def take(self, wish: OrderRequest, by: str, token: str, key: str = "") -> Order:
+        """The same under the same `key` is the same order, as long as a pot knows of it.
+
+        Raises NotFound for an unknown plant, Refused when nothing ripe is known.
+        """
         pots = self._peers.of_kind("plant")
         asked = [pot for pot in pots if wish.plant_id in ("", pot.id)]
         if not asked:
@@ -173,9 +179,15 @@ class Counter:
         self._taken += 1
         now_s = self._clock.now()
         order_id = f"o{int(1000 * now_s)}-{self._taken}"
+        if key:
+            order_id = "o" + sha256("\0".join((by, key)).encode()).hexdigest()[:16]
+            tasks = await all_tasks(self._mesh, self._peers)
+            if (before := order_of(order_id, tasks, self._orders.get(order_id))) is not None:
+                return before
 
         async def send(pot: Peer, request: TaskRequest) -> Task:
-            return await _pass_on(self._mesh, pot, "/tasks", request.model_dump_json().encode(), token, Task)
+            content = request.model_dump_json().encode()
+            return await _pass_on(self._mesh, pot, "/tasks", content, token, Task, key=f"order {order_id}")
 
         parts = await place(order_id, wish, asked, self._mesh, send)
         order = Order(
@@ -234,15 +246,16 @@ def _add_orders(app: FastAPI, counter: Counter) -> None:
         authorization: Token = "",
         caller: Caller = allow("operator"),
         request: OrderRequest = body(OrderRequest),
+        idempotency_key: Key = "",
     ) -> Order:
-        taken = await counter.take(request, caller.subject, authorization)
+        taken = await counter.take(request, caller.subject, authorization, idempotency_key)
         response.headers["location"] = f"/orders/{taken.order_id}"
         return taken
 
 
 async def _pass_on(
-    mesh: Mesh, peer: Peer, path: str, content: bytes, token: str, expect: type[D], method: str = "POST"
+    mesh: Mesh, peer: Peer, path: str, content: bytes, token: str, expect: type[D], method: str = "POST", key: str = ""
 ) -> D:
     """With the caller's own token: the console has no power of its own."""
-    answer = await mesh.exchange(peer, method, path, content, headers={"authorization": token})
+    answer = await mesh.exchange(peer, method, path, content, headers={"authorization": token}, key=key)
     return read(peer, answer, expect)

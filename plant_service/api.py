@@ -168,8 +168,13 @@ def _task_routes(app: FastAPI, pot: Pot) -> None:
         return pot.place.market.tasks()
 
     @app.post("/tasks", tags=["tasks"], summary="Ask for water, a scan or ripe fruit", status_code=201)
-    async def ask(response: Response, caller: Caller = allow("operator"), request: TaskRequest = body(TaskRequest)) -> Task:
-        task = await pot.ask(request, caller.subject)
+    async def ask(
+        response: Response,
+        caller: Caller = allow("operator"),
+        request: TaskRequest = body(TaskRequest),
+        idempotency_key: IdempotencyKey = "",
+    ) -> Task:
+        task = await pot.ask(request, caller.subject, idempotency_key)
         response.headers["location"] = f"/tasks/{task.task_id}"
         return task
 

@@ -8,6 +8,7 @@ from urllib.parse import parse_qs, urlsplit
 from core import soil
 from core.allocation import permits
 from core.allocation.docks import Docks, DocksDocument
+from core.allocation.plant_state import Keyed
 from core.clock import Clock
 from core.errors import DriverError, Refused, StorageError, Unavailable, Unprocessable
 from core.soil import Limits, ProbeState, Reading
@@ -155,13 +156,21 @@ class Pot:
 
     # What others ask for
 
-    async def ask(self, request: TaskRequest, by: str) -> Task:
-        """An operator wants something here; raises Conflict or Refused."""
+    async def ask(self, request: TaskRequest, by: str, key: str = "") -> Task:
+        """An operator wants something here; the same request under the same `key` is the same task, restarts or not.
+
+        Raises Conflict or Refused, and Unprocessable for a key that came with another request.
+        """
+        asking = Keyed.of(by, key, request.model_dump_json().encode()) if key else None
+        if asking is not None and (task := await self.place.change(lambda m, _: m.asked_before(asking))) is not None:
+            return task
         if request.kind != "water":
-            return await self.tending.ask(request, by)
+            return await self.tending.ask(request, by, asking)
         dose = request.dose_ml if request.dose_ml is not None else self.care.machine.settings.dose_ml
         return await self.place.change(
-            lambda m, now_s: m.ask("water", dose, by, "asked by hand", now_s, request.priority, within_s=request.within_s)
+            lambda m, now_s: m.ask(
+                "water", dose, by, "asked by hand", now_s, request.priority, within_s=request.within_s, asking=asking
+            )
         )
 
     async def set_care(self, patch: SettingsPatch, by: str) -> Settings:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from starlette.responses import Response
 
 from core.allocation.picking import may_be_picked
+from core.allocation.plant_state import Keyed
 from core.clock import Clock
 from core.errors import Conflict, Refused
 from core.growth.forecast import forecast, uncertainty
@@ -117,14 +118,15 @@ class Tending:
 
     # What people ask for
 
-    async def ask(self, request: TaskRequest, by: str) -> Task:
+    async def ask(self, request: TaskRequest, by: str, asking: Keyed | None = None) -> Task:
         """A scan, or ripe fruit; raises Conflict or Refused."""
         if request.kind == "inventory":
             return await self._place.change(
                 lambda m, now_s: m.ask(
-                    "inventory", 0.0, by, "asked by hand", now_s, request.priority, within_s=request.within_s
+                    "inventory", 0.0, by, "asked by hand", now_s, request.priority,
+                    within_s=request.within_s, asking=asking,
                 )
-            )
+            )  # fmt: skip
         await self._make_way(by)
         promised = {name for t in self._place.market.open_tasks() if t.kind == "harvest" for name in t.fruit_ids}
         names = request.fruit_ids or [fruit.fruit_id for fruit in self.ripe() if fruit.fruit_id not in promised]
@@ -137,6 +139,7 @@ class Tending:
             lambda m, now_s: m.ask(
                 "harvest", 0.0, by, f"{count} ripe fruit: {why}", now_s, request.priority,
                 within_s=request.within_s, fruit_ids=names, count=count, order_id=request.order_id,
+                asking=asking,
             )
         )  # fmt: skip
 

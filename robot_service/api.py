@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
-from fastapi import FastAPI, Path, Query, Response
+from fastapi import FastAPI, Header, Path, Query, Response
 from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
@@ -136,8 +136,13 @@ def _camera(app: FastAPI, brain: Brain) -> None:
 
 def _jobs(app: FastAPI, brain: Brain) -> None:
     @app.post("/jobs", summary="A job from a supervisor", tags=["operator"], status_code=202)
-    async def post_job(response: Response, caller: Caller = allow("operator"), wish: JobRequest = body(JobRequest)) -> Job:
-        job = brain.add_job(wish)
+    async def post_job(
+        response: Response,
+        caller: Caller = allow("operator"),
+        wish: JobRequest = body(JobRequest),
+        idempotency_key: Annotated[str, Header(max_length=128)] = "",
+    ) -> Job:
+        job = brain.add_job(wish, caller.subject, idempotency_key)
         response.headers["location"] = f"/jobs/{job.job_id}"
         return job
 

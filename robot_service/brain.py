@@ -289,8 +289,20 @@ class Brain:
         return queued(entry)
 
     # ------------------------------------------------------------------ the operator
-    def add_job(self, wish: JobRequest) -> Job:
-        """Queue a direct job; raises Unprocessable for one that makes no sense here."""
+    def add_job(self, wish: JobRequest, by: str = "", key: str = "") -> Job:
+        """Queue a direct job, once for one `key` as long as the job is remembered.
+
+        Raises Unprocessable for one that makes no sense here.
+        """
+        request = wish.model_dump_json()
+        if key and (before := self.reporter.asked_before(by, key, request)) is not None:
+            return before
+        job = self._new_job(wish)
+        if key:
+            self.reporter.remember_key(by, key, request, job)
+        return job
+
+    def _new_job(self, wish: JobRequest) -> Job:
         if wish.kind == "dock" and self.settings.map.dock(wish.at) is None:
             known = ", ".join(dock.name for dock in self.settings.map.docks)
             raise Unprocessable(f"no dock {wish.at!r}", hint=f"one of: {known}")

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from core.allocation.queue import Entry, TaskQueue
-from core.errors import GardenError, NotFound, Unavailable
+from core.errors import GardenError, NotFound, Unavailable, Unprocessable
 from core.wire.market import Report, ReportAnswer
 from core.wire.robot import Job
 from robot_service.robot import Robot
@@ -41,6 +41,8 @@ class Reporter:
     queue: TaskQueue
     kill: Callable[[Entry, str], None] = lambda entry, why: None
     jobs: dict[str, Job] = field(default_factory=dict)
+    keys: dict[tuple[str, str], tuple[str, str]] = field(default_factory=dict)
+    """By whom and with which Idempotency-Key: what was asked for, and the job's id."""
     _told: dict[str, _Told] = field(default_factory=dict)
     _finals: deque[_Final] = field(default_factory=lambda: deque(maxlen=100))
     _soon: asyncio.Event = field(default_factory=asyncio.Event)
@@ -72,6 +74,18 @@ class Reporter:
         while len(self.jobs) > JOBS_KEPT:
             del self.jobs[next(iter(self.jobs))]
         return job
+
+    def remember_key(self, by: str, key: str, request: str, job: Job) -> None:
+        """As long as the job itself."""
+        self.keys = {name: (asked, job_id) for name, (asked, job_id) in self.keys.items() if job_id in self.jobs}
+        self.keys[by, key] = request, job.job_id
+
+    def asked_before(self, by: str, key: str, request: str) -> Job | None:
+        """The job that this request made when it first came; raises Unprocessable when its key came with another."""
+        asked, job_id = self.keys.get((by, key), (request, ""))
+        if asked != request:
+            raise Unprocessable("this Idempotency-Key came before with another body", hint="take a new key")
+        return self.job(job_id) if job_id in self.jobs else None
 
     def job(self, job_id: str) -> Job:
         """Raises NotFound."""

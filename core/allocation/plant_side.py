@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from core.allocation.picking import Picking, picked, settles, told
-from core.allocation.plant_state import Limits, Live, MarketDocument, Note, Rules
+from core.allocation.plant_state import Keyed, Limits, Live, MarketDocument, Note, Rules
 from core.allocation.tasks import TaskBook
 from core.allocation.watering import Measured, Watering
 from core.errors import Conflict, Refused
@@ -92,7 +92,7 @@ class Market(TaskBook):
             failures={k: v for k, v in self._failures.items() if k in self._tasks}, open_permit=self._water.open,
             doses=list(self._water.doses), doses_at_s=self._water.at_s, open_pick=self._picks.open,
             doubts=list(self._picks.doubts.values()),
-            scanned={k: v for k, v in self._scanned.items() if k in self._tasks},
+            scanned={k: v for k, v in self._scanned.items() if k in self._tasks}, keyed=list(self._keyed.values()),
         )  # fmt: skip
 
     # Events: people and the plant
@@ -110,9 +110,11 @@ class Market(TaskBook):
         fruit_ids: Sequence[str] = (),
         count: int = 0,
         order_id: str = "",
+        asking: Keyed | None = None,
     ) -> Task:
-        """A new task; raises Conflict while another of its kind (or, of a harvest, for one of its fruit) is open.
+        """A new task, remembered as what `asking` made.
 
+        Raises Conflict while another of its kind (or, of a harvest, for one of its fruit) is open.
         Raises Refused when it could not be served safely.
         """
         for task in self.open_tasks():
@@ -132,6 +134,8 @@ class Market(TaskBook):
         )  # fmt: skip
         self._tasks[task_id] = task
         self._live[task_id] = Live(next_ask_s=now_s)
+        if asking is not None:
+            self._remember(asking, task)
         self._event(task, f"asked for by {by}: {why}", now_s)
         return self._tasks[task_id]
 

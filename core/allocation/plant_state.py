@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from hashlib import sha256
 from typing import Any
 
 from core.allocation import permits
@@ -52,6 +53,8 @@ class Rules:
     rounds_kept: int = 6
     events_kept: int = 40
     finished_kept: int = 20
+    forgotten_keys_kept: int = 100
+    """Idempotency-Keys whose tasks are forgotten and that are refused still."""
     open_max: int = 16
     auctions_max: int = 4
     """Rounds of bids that are open at the same time; further tasks wait, the more urgent first."""
@@ -64,6 +67,23 @@ class Limits:
     soak_s: float = 60.0
     day_cap_ml: float = 1500.0
     target_ratio: float = 0.24
+
+
+class Keyed(Document):
+    """A person's request under an Idempotency-Key, in digests: whoever sends it again gets the same task again."""
+
+    name: str
+    """Of the asker and the key."""
+    request: str
+    task_id: str = ""
+
+    @classmethod
+    def of(cls, by: str, key: str, request: bytes) -> Keyed:
+        return cls(name=_digest(f"{by}\0{key}".encode()), request=_digest(request))
+
+
+def _digest(words: bytes) -> str:
+    return sha256(words).hexdigest()[:32]
 
 
 class MarketDocument(Document):
@@ -82,6 +102,7 @@ class MarketDocument(Document):
     """Picks that were permitted and that nobody told the end of."""
     scanned: dict[str, str] = {}
     """Inventory tasks whose scan has come, and its id."""
+    keyed: list[Keyed] = []
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,8 @@ from zlib import crc32
 
 from core.allocation.auction import SILENT, Round, better_than_holder, cheapest, told, worth_s
 from core.allocation.epochs import Names, owner_of
-from core.allocation.plant_state import Effect, Grant, Kill, Live, MarketDocument, Note, Rules, Solicit
-from core.errors import NotFound
+from core.allocation.plant_state import Effect, Grant, Keyed, Kill, Live, MarketDocument, Note, Rules, Solicit
+from core.errors import Conflict, NotFound, Unprocessable
 from core.wire.market import FINAL_STATES, Announcement, Award, Bid, BidRound, PlantCard, Task, TaskEvent
 
 SILENCES_MAX = 3
@@ -29,6 +29,7 @@ class TaskBook:
         self._names = Names(card.plant_id, before.boot + 1)
         self._tasks = {task.task_id: task for task in before.tasks}
         self._failures = dict(before.failures)
+        self._keyed = {each.name: each for each in before.keyed}
         for task in self.open_tasks():
             self._tasks[task.task_id] = _in_new_time(task, now_s)
         self._live = {task.task_id: Live.revived(task, now_s, self.rules) for task in self.open_tasks()}
@@ -92,6 +93,19 @@ class TaskBook:
         """When such a task last failed at its own work: deadlines say nothing against asking again, nor does what was before
         a restart, for somebody may have mended it. Minus infinity when none did."""
         return self._gave_up_s.get(kind, -math.inf)
+
+    def asked_before(self, asking: Keyed) -> Task | None:
+        """The task that this request made when it first came; None for a new request.
+
+        Raises Unprocessable when its key came with another request, Conflict when the task is forgotten.
+        """
+        if (before := self._keyed.get(asking.name)) is None:
+            return None
+        if before.request != asking.request:
+            raise Unprocessable("this Idempotency-Key came before with another body", hint="take a new key")
+        if (task := self._tasks.get(before.task_id)) is None:
+            raise Conflict(f"{before.task_id}, asked for under this Idempotency-Key, ended long ago", hint="take a new key")
+        return task
 
     def due_s(self) -> float:
         """When `tick` is next worth calling."""
@@ -315,6 +329,13 @@ class TaskBook:
         return task
 
     # Book-keeping
+
+    def _remember(self, asking: Keyed, task: Task) -> None:
+        """Keys live as long as their tasks, and the newest somewhat longer."""
+        self._keyed[asking.name] = asking.model_copy(update={"task_id": task.task_id})
+        forgotten = [name for name, each in self._keyed.items() if each.task_id not in self._tasks]
+        for name in forgotten[: -self.rules.forgotten_keys_kept]:
+            del self._keyed[name]
 
     def _put(self, task: Task, now_s: float, **changes: Any) -> Task:
         self.dirty = True

@@ -10,8 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from console.orders import Stock, call_off, missing, order_of, split, top_up
+from console.service import Counter
+from core.clock import VirtualClock
 from core.errors import Conflict, PeerDown
-from core.mesh.peers import Peer
+from core.mesh.client import Answer
+from core.mesh.peers import Peer, Peers
 from core.wire.fruit import Forecast, Fruit, Inventory, Pick
 from core.wire.market import Task, TaskRequest
 from core.wire.order import Order, OrderPart, OrderRequest
@@ -181,3 +184,37 @@ def test_an_order_is_not_topped_up_while_it_runs_once_called_off_nor_under_a_dea
     assert pots.top_up(short, wish.model_copy(update={"within_s": 60.0})) is None
     assert Pots(**{"plant-3": 0}).top_up(short, wish) is None
     assert pots.asked == []
+
+
+class Asked(Pots):
+    """They take what they are asked for, each key once, and remember it."""
+
+    def __init__(self, **ripe: int) -> None:
+        super().__init__(**ripe)
+        self.taken: dict[tuple[str, str], Task] = {}
+
+    def answer(self, name: str, path: str) -> Any:
+        if path == "/tasks":
+            return [task for (pot, _), task in self.taken.items() if pot == name]
+        return super().answer(name, path)
+
+    async def exchange(self, pot: Peer, method: str, path: str, body: bytes, *, headers: Any, key: str) -> Answer:
+        assert key
+        request = TaskRequest.model_validate_json(body)
+        made = task(pot.id, "announced", 0, request.count or 0).model_copy(update={"order_id": request.order_id})
+        return Answer(201, self.taken.setdefault((pot.id, key), made).model_dump_json().encode())
+
+
+def test_an_order_recorded_and_sent_again_is_the_same_order_also_at_a_console_that_forgot() -> None:
+    pots, wish = Asked(**{"plant-1": 2, "plant-2": 1}), OrderRequest(count=3)
+
+    def send(key: str, by: str = "operator") -> Order:
+        counter = Counter(pots, Peers(pots.peers), VirtualClock())  # type: ignore[arg-type]
+        return asyncio.run(counter.take(wish, by, "Bearer token", key))
+
+    first = send("k1")
+    assert (first.count, len(pots.taken)) == (3, 2)
+    assert send("k1").order_id == first.order_id
+    assert len(pots.taken) == 2
+    assert send("k1", "anna").order_id != first.order_id
+    assert send("").order_id != send("k2").order_id

@@ -181,6 +181,33 @@ def test_a_posted_task_is_created_once_for_one_idempotency_key(play: Play) -> No
     play(story)
 
 
+def test_a_recorded_request_asks_for_nothing_new_ten_minutes_and_a_restart_later(play: Play) -> None:
+    async def story(garden: Garden) -> None:
+        robot = garden.robot("robot-1")
+        garden.pot(ratio=0.3)
+        await garden.clock.sleep(2.0)
+        send = {"json": {"kind": "water", "dose_ml": 60.0}, "headers": {"idempotency-key": "k1"}}
+        first = (await garden.call("plant-1", "POST", "/tasks", **send)).json()
+        await garden.until_task("done")
+        await garden.clock.sleep(700.0)
+        for _ in range(2):
+            again = await garden.call("plant-1", "POST", "/tasks", **send)
+            assert (again.status_code, again.headers["location"]) == (201, f"/tasks/{first['task_id']}")
+            assert (again.json()["task_id"], again.json()["state"]) == (first["task_id"], "done")
+            await garden.kill_pot()
+            garden.start_pot()
+            await garden.clock.sleep(2.0)
+        other = await garden.call("plant-1", "POST", "/tasks", **send | {"json": {"kind": "water", "dose_ml": 61.0}})
+        assert (other.status_code, "another body" in other.json()["detail"]) == (422, True)
+        assert len((await garden.call("plant-1", "GET", "/tasks")).json()) == 1
+        theirs = await garden.call("plant-1", "POST", "/tasks", **send, who="bob")
+        assert theirs.json()["task_id"] != first["task_id"], "keys are told apart by who sends them"
+        await garden.until_task("done")
+        assert robot.poured_ml == 120.0
+
+    play(story)
+
+
 def test_a_permit_is_one_shot_but_its_question_may_be_repeated(play: Play) -> None:
     async def story(garden: Garden) -> None:
         robot = garden.robot("robot-1")

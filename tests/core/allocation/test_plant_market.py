@@ -15,9 +15,9 @@ from core.allocation.auction import Round, better_than_holder, cheapest, no_bid,
 from core.allocation.epochs import Names, owner_of
 from core.allocation.permits import DAY_S, Dose, OpenPermit, given_ml, revived, rise_needed
 from core.allocation.plant_side import Market
-from core.allocation.plant_state import Grant, Kill, Limits, MarketDocument, Solicit
+from core.allocation.plant_state import Grant, Keyed, Kill, Limits, MarketDocument, Solicit
 from core.allocation.watering import Measured
-from core.errors import Conflict, NotFound, Refused
+from core.errors import Conflict, NotFound, Refused, Unprocessable
 from core.wire.geometry import Point3, Pose2
 from core.wire.market import Bid, Permit, PermitRequest, PlantCard, Report
 
@@ -470,6 +470,30 @@ def test_finished_tasks_are_forgotten_after_a_while() -> None:
     for n in range(40):
         made.cancel(made.ask("water", 10.0, "operator", "", float(n)).task_id, "operator", "", float(n))
     assert len(made.tasks()) == made.rules.finished_kept
+
+
+def test_a_key_is_known_as_long_as_its_task_and_refused_for_a_while_after() -> None:
+    made = market()
+
+    def asked(n: int) -> Keyed:
+        return Keyed.of("operator", f"k{n}", b"water")
+
+    many = made.rules.finished_kept + made.rules.forgotten_keys_kept
+    for n in range(many + 20):
+        assert made.asked_before(asked(n)) is None
+        task = made.ask("water", 10.0, "operator", "", float(n), asking=asked(n))
+        made = market(made.document(), float(n))
+        found = made.asked_before(asked(n))
+        assert found is not None
+        assert found.task_id == task.task_id
+        made.cancel(task.task_id, "operator", "", float(n))
+    with pytest.raises(Unprocessable):
+        made.asked_before(Keyed.of("operator", f"k{many}", b"a scan"))
+    assert made.asked_before(Keyed.of("anna", f"k{many}", b"water")) is None
+    with pytest.raises(Conflict, match="ended long ago"):
+        made.asked_before(asked(21))
+    assert made.asked_before(asked(0)) is None
+    assert len(made.document().keyed) <= many + 1
 
 
 # Random orders of events

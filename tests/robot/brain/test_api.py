@@ -55,6 +55,23 @@ def test_a_job_is_202_with_its_place_and_can_be_watched_and_called_off():
     asked(story)
 
 
+def test_a_job_comes_once_for_one_key_as_long_as_it_is_remembered():
+    async def story(garden):
+        async def post(x_m, key="k1"):
+            return await garden.call("robot-1", "POST", "/jobs", JobRequest(kind="goto", x_m=x_m, y_m=0.0), key=key)
+
+        first = await post(0.0)
+        await garden.clock.sleep(700.0)
+        again = await post(0.0)
+        assert (again.status_code, again.headers["location"]) == (202, first.headers["location"])
+        assert again.json()["state"] == "done"
+        assert (await post(0.1)).status_code == 422
+        assert (await post(0.0, "k2")).headers["location"] != first.headers["location"]
+        assert len((await garden.call("robot-1", "GET", "/jobs")).json()) == 2
+
+    asked(story)
+
+
 @pytest.mark.parametrize(
     "wish",
     [JobRequest(kind="goto"), JobRequest(kind="dock", at="nowhere"), JobRequest(kind="goto", x_m=-0.55, y_m=0.75)],
