@@ -136,7 +136,7 @@ async def no_surplus(request: Request) -> None:
     if dependant is None:
         return
     known = query_names(dependant)
-    if strange := next((name for name in request.query_params if name not in known), None):
+    if (strange := next((name for name in request.query_params if name not in known), None)) is not None:
         hint = f"known here: {', '.join(sorted(known))}" if known else "this takes no query parameter"
         raise Unprocessable(f"no query parameter {strange[:40]!r}", hint=hint)
     takes_any = readers(dependant) or raw_reader(dependant)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import httpx
@@ -23,6 +24,7 @@ from core.mesh.strict import readers
 from core.virtual import VirtualLoop
 from lab import story
 from lab.garden import Garden
+from lab.mesh import MemoryMesh
 
 SUBJECTS = {"plant": "plant-1", "robot": "robot-1", "operator": "operator", "viewer": "viewer"}
 KINDS = {"plant": "plant-1", "station": "station", "robot": "robot-1", "sim": "sim", "console": "console"}
@@ -32,7 +34,7 @@ LOOKED_AT = {
     "station": ("/state", "/dock"),
     "robot": ("/tasks", "/jobs", "/stopped-of-state"),
     "sim": ("/faults", "/clock"),
-    "console": (),
+    "console": ("/orders",),
 }
 FLOODING = {"GARDEN_FLOOD_HOPS": "3"}
 """So that nodes have a door for it."""
@@ -81,6 +83,8 @@ class Doors:
     garden: Garden
     apps: dict[str, FastAPI]
     key: GardenKey
+    mesh: MemoryMesh
+    """Another way to the same apps, by kind: in half the time, as there is no client."""
     asked: int = 0
     statuses: dict[int, int] = field(default_factory=dict)
 
@@ -123,6 +127,15 @@ class Doors:
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
             async with asyncio.timeout(30):
                 answer = await client.request(method, path, headers=headers, **more)
+        return self._counted(answer)
+
+    async def knock(self, kind: str, method: str, path: str, headers: Any, content: bytes) -> httpx.Response:
+        """One request as it is, without a token of ours. For the loop's own coroutines."""
+        request = httpx.Request(method, f"http://{kind}{path}", headers=headers, content=content)
+        async with asyncio.timeout(30):
+            return self._counted(await self.mesh.carry("door", request))
+
+    def _counted(self, answer: httpx.Response) -> httpx.Response:
         self.asked += 1
         self.statuses[answer.status_code] = self.statuses.get(answer.status_code, 0) + 1
         self.garden.check()
@@ -179,7 +192,10 @@ def open_doors(folder: Path) -> Iterator[Doors]:
             runner.run(garden.clock.sleep(6.0))
             apps = {kind: _app(garden, name) for kind, name in KINDS.items() if kind != "console"}
             apps["console"] = runner.run(_console(garden))
-            yield Doors(runner, garden, apps, GardenKey.load(folder / "keys" / "garden.key"))
+            mesh = MemoryMesh(garden.clock, Random(0), latency_s=0.0)
+            for kind, app in apps.items():
+                mesh.attach(kind, kind, app)
+            yield Doors(runner, garden, apps, GardenKey.load(folder / "keys" / "garden.key"), mesh)
         finally:
             runner.run(garden.__aexit__(None, None, None))
 
