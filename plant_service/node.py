@@ -16,7 +16,7 @@ from core.mesh.client import Mesh, PeerTransport
 from core.mesh.metrics import measure
 from core.mesh.node import Node
 from core.mesh.peers import Peers
-from core.mesh.presence import add_presence, introducer
+from core.mesh.presence import add_presence
 from core.store import Disk, DurableDocument
 from core.wire.plant import SettingsPatch
 from hw.drivers.probes import open_probe, open_valve
@@ -74,7 +74,7 @@ def build(
     parts = _Parts(settings, clock, opener, mesh, verifier, peers, journal, open_reads, disk)
     parts.probes, parts.valves = probes, valves
     node = maker(parts)
-    add_presence(node.app, peers, clock, introducer(identity, node.kind, settings.url))
+    add_presence(node.app, peers, clock, identity, node.kind, settings.url)
     return node
 
 

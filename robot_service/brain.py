@@ -22,7 +22,7 @@ from core.mesh.client import Mesh, PeerTransport
 from core.mesh.events import EventLog
 from core.mesh.node import Node
 from core.mesh.peers import Peers
-from core.mesh.presence import add_presence, introducer
+from core.mesh.presence import add_presence
 from core.robots import gardener
 from core.robots.markers import ceiling_markers
 from core.wire.body import BodyState
@@ -35,6 +35,7 @@ from hw.links import Opener
 from robot_service.bodylink import BodyLink
 from robot_service.docks import Docks
 from robot_service.eye import Eye
+from robot_service.fitness import PUMP, Fitness
 from robot_service.ground import Ground
 from robot_service.localisation import Localisation
 from robot_service.neighbours import Neighbours
@@ -72,8 +73,9 @@ class Brain:
         self.events = EventLog(clock)
         neighbours = Neighbours(settings.id, peers, mesh, clock, lambda: self.robot.moving, lambda: where.pose, self._idle)
         self.robot = Robot(
-            settings, clock, rng, self.body, where, Ground(settings.map), neighbours, mesh, peers, self.events, eye
-        )
+            settings, clock, rng, self.body, where, Ground(settings.map), neighbours, mesh, peers, self.events, eye,
+            Fitness(clock),
+        )  # fmt: skip
         self.docks = Docks(settings.id, mesh, peers, clock, neighbours.calm)
         self.queue = TaskQueue()
         self.reporter = Reporter(self.robot, self.queue)
@@ -97,6 +99,8 @@ class Brain:
             self.robot.note("stop", f"stopped by {state.stopped_by}" if state.stopped else "released")
             if state.stopped:
                 self.scheduler.halt(f"stopped by {state.stopped_by or 'the e-stop'}")
+            else:
+                self.robot.fitness.looked_after()
 
     def missing(self) -> list[str]:
         """What keeps it from work, for `/readyz`."""
@@ -133,7 +137,7 @@ class Brain:
             stop_number=0 if body is None else body.stop_number,
             stopped=stopped,
             stopped_by="" if body is None else body.stopped_by,
-            down=[self.body.down] if self.body.down or body is None else list(body.down),
+            down=[self.body.down] if self.body.down or body is None else [*body.down, *self.robot.fitness.told()],
             queue=[queued(entry) for entry in self.queue.entries if entry.kind != "job"],
             route=[Point2(x_m=x, y_m=y) for x, y in activity.route],
         )
@@ -200,10 +204,11 @@ class Brain:
     def condition(self) -> Condition:
         body, where = self.body.state, self.robot.where
         begun = self.queue.begun
-        docks = self.settings.map.docks
+        docks, broken = self.settings.map.docks, self.robot.fitness.why_not(PUMP)
         return Condition(
             robot_id=self.settings.id,
             can=self._can(),
+            unfit={"water": broken} if broken else {},
             travel=self.travel_s,
             stopped_by=(body.stopped_by if body is not None and body.stopped else None),
             down=(self.body.down,) if self.body.down else tuple(body.down if body is not None else ("body",)),
@@ -214,7 +219,7 @@ class Brain:
             current=None if begun is None else self._stop(begun),
             at_work_s=0.0 if begun is None else self._at_work_s(begun),
             queue=tuple(self._stop(entry) for entry in self.queue.waiting),
-            taps=tuple(dock.name for dock in docks if dock.tap),
+            taps=tuple(dock.name for dock in docks if dock.tap and not self.robot.fitness.why_not(dock.name)),
             chargers=tuple(dock.name for dock in docks),
         )
 
@@ -253,6 +258,8 @@ class Brain:
             raise Unprocessable(f"{plant_id} is not a plant we know")
         if award.announcement.kind not in self._can():
             raise Unprocessable(f"cannot {award.announcement.kind}")
+        if award.announcement.kind == "water" and (broken := self.robot.fitness.why_not(PUMP)):
+            raise Overtaken(broken, hint="ask all robots again")
         self._check_price(award)
         at = deadlines.place(award.announcement, self.condition(), self._promised())
         entry = self.queue.award(award, self.clock.now(), at)
@@ -439,7 +446,7 @@ def build(
     peers = peers if peers is not None else Peers()
     brain = Brain(settings, clock, opener, mesh, peers, rng, eye, hand)
     app = make_app(brain, verifier, open_reads)
-    add_presence(app, peers, clock, introducer(identity, "robot", settings.url))
+    add_presence(app, peers, clock, identity, "robot", settings.url)
     app.state.brain = brain
     loops = [brain.body.run, brain.robot.neighbours.run, brain.docks.run, brain.reporter.run, brain.scheduler.run]
     if camera is not None:

@@ -23,12 +23,15 @@ class RobotReadings:
         self._brain = brain
         self._late_s: deque[float] = deque(maxlen=LATE_KEPT)
         self._due_s: float | None = None
+        self._refusals, self._refusal = 0, ""
         brain.body.listeners.append(self._heard)
 
     def _heard(self, state: BodyState) -> None:
         if self._due_s is not None:
             self._late_s.append(max(0.0, state.stamp_s - self._due_s))
         self._due_s = state.stamp_s + state.next_in_s
+        self._refusals += state.refusal not in ("", self._refusal)
+        self._refusal = state.refusal
 
     def read(self) -> Iterator[Reading]:
         yield from self._work()
@@ -46,6 +49,8 @@ class RobotReadings:
             "garden_waiting", "1 while it waits for something: /state says for what", bool(brain.robot.activity.waiting)
         )
         yield Reading("garden_reports_unheard", "Ends that no plant has heard yet", brain.reporter.unheard)
+        yield Reading("garden_parts_failed", "Pumps and taps it does not count on for now", len(brain.robot.fitness.told()))
+        yield Reading("garden_refusals_total", "Times the body's gate refused what was asked", self._refusals)
         yield Reading("garden_docks_held", "Docks reserved", len(brain.docks.holds))
 
     def _body(self) -> Iterator[Reading]:

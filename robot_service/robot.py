@@ -23,6 +23,7 @@ from core.wire.geometry import Pose2
 from robot_service.bodylink import BodyLink
 from robot_service.eye import Eye
 from robot_service.failed import SkillFailed
+from robot_service.fitness import Fitness
 from robot_service.ground import Ground
 from robot_service.localisation import Localisation
 from robot_service.neighbours import Neighbours
@@ -63,6 +64,7 @@ class Robot:
     peers: Peers
     events: EventLog
     eye: Eye
+    fitness: Fitness
     activity: Activity = field(default_factory=Activity)
     _last: BodyState | None = None
     _felt: BodyState | None = None

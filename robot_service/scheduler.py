@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -17,6 +18,7 @@ from core.allocation.right_of_way import RANK_IDLE, in_the_way_of
 from core.geometry.planar import distance_m
 from core.wire.market import Report
 from robot_service.docks import RENEW_S, Docks
+from robot_service.fitness import PUMP
 from robot_service.planner import Planner
 from robot_service.reporter import Reporter
 from robot_service.robot import RANK_BUSY, Halted, Robot, SkillFailed, reason_of, tuple_of
@@ -81,11 +83,32 @@ class Scheduler:
     def halt(self, why: str) -> None:
         """The e-stop: what waits in the queue is given back; what runs ends by itself at its next look."""
         for entry in list(self.queue.entries):
-            if entry.running:
+            if not entry.running:
+                self._give_back(entry, why)
+
+    def _give_back(self, entry: Entry, why: str) -> None:
+        """The plant asks others."""
+        self.queue.drop(entry)
+        if entry.announcement is not None:
+            self.robot.note("kill", f"{entry.kind} given back: {why}", task_id=entry.task_id)
+            self.reporter.finish(entry, _gave_up(self.robot.settings.id, entry, why))
+
+    def _give_back_undoable(self) -> None:
+        """What waits and asks for a pump that failed, or for water that is nowhere to be had."""
+        robot, state = self.robot, self.robot.body.state
+        broken, dry = robot.fitness.why_not(PUMP), self._no_water()
+        left_ml = math.inf if state is None or state.tank_ml is None else state.tank_ml
+        for entry in list(self.queue.waiting):
+            if entry.announcement is None or entry.kind != "water" or entry.running:
                 continue
-            self.queue.drop(entry)
-            if entry.announcement is not None:
-                self.reporter.finish(entry, _gave_up(self.robot.settings.id, entry, why))
+            left_ml -= entry.announcement.dose_ml
+            if broken or (dry and left_ml < TANK_RESERVE_ML):
+                self._give_back(entry, broken or dry)
+
+    def _no_water(self) -> str:
+        """Why no tap gives water; empty when one may."""
+        dry = {dock.name: self.robot.fitness.why_not(dock.name) for dock in self.robot.settings.map.docks if dock.tap}
+        return "; ".join(dry.values()) if all(dry.values()) else ""
 
     # ------------------------------------------------------------------ the loop
     async def run(self) -> None:
@@ -123,7 +146,7 @@ class Scheduler:
             return "charge"
         dose_ml = head.announcement.dose_ml if head is not None and head.announcement is not None else 0.0
         if state.tank_ml is not None and head is not None and state.tank_ml < dose_ml + TANK_RESERVE_ML:
-            return "refill"
+            return None if self._no_water() else "refill"
         return None
 
     async def _execute(self, entry: Entry) -> None:
@@ -145,6 +168,7 @@ class Scheduler:
         if entry.announcement is None and report.state == "failed":
             self._own_after_s = self.robot.clock.now() + OWN_RETRY_S
         self.reporter.jobs_ended(entry, report)
+        self._give_back_undoable()
         self._sent = entry.job is not None and entry.job.kind in ("goto", "undock") and report.state == "done"
         if cut and self.robot.where.docked_at and not self._stopped():
             await self._worked(self._leave())

@@ -10,8 +10,8 @@ waiting time, MiniAve); charge and refill on the way are ours.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from core.robots import gardener
@@ -69,6 +69,8 @@ class Condition:
     robot_id: str
     can: frozenset[str]
     travel: Travel
+    unfit: Mapping[TaskKind, str] = field(default_factory=dict)
+    """Kinds of tasks that it is fitted for and cannot do for now, and why."""
     stopped_by: str | None = None
     """Who latched the e-stop; None when it is released."""
     down: tuple[str, ...] = ()
@@ -83,6 +85,7 @@ class Condition:
     queue: tuple[Stop, ...] = ()
     """What waits, in the order in which it will be done."""
     taps: tuple[str, ...] = ()
+    """Docks where water is to be had."""
     chargers: tuple[str, ...] = ()
 
 
@@ -128,7 +131,7 @@ class _Walk:
         return min(known, key=lambda dock: (known[dock], dock)) if known else None
 
     def drink(self, dose_ml: float) -> float | None:
-        """Seconds until there is water for a dose: none, or the nearest tap's; None when no tap can be reached."""
+        """Seconds until there is water for a dose: none, or the nearest tap's; None when there is no tap."""
         if dose_ml == 0.0 or dose_ml + TANK_RESERVE_ML <= self.tank_ml:
             return 0.0
         tap = self.nearest(self.me.taps)
@@ -330,6 +333,8 @@ def _unable(asked: Announcement, me: Condition) -> str:
     """Why the robot cannot even think of it; empty when it can."""
     if asked.kind not in me.can:
         return f"cannot {asked.kind}: not fitted for it" if asked.kind != "water" else "no pump"
+    if asked.kind in me.unfit:
+        return me.unfit[asked.kind]
     if me.stopped_by is not None:
         return f"stopped by {me.stopped_by or 'the e-stop'}"
     if me.down:
@@ -348,7 +353,7 @@ def _unable(asked: Announcement, me: Condition) -> str:
 def _own(asked: Announcement, walk: _Walk) -> tuple[float, float, float, float] | str:
     """What the task itself takes: refill and charge where needed, then the way and the work [s]; or why it cannot be."""
     if (water_s := walk.drink(asked.dose_ml)) is None:
-        return f"the tank holds {walk.tank_ml:.0f} ml and no tap can be reached"
+        return f"the tank holds {walk.tank_ml:.0f} ml and there is no tap to fill it at"
     charging_s = 0.0
     if walk.battery_ratio < BATTERY_FORCED_RATIO:
         charger = walk.nearest(walk.me.chargers)

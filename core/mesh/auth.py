@@ -53,6 +53,10 @@ class Identity:
     """The garden's word that `key` is this node's. No token: whoever reads it can do nothing with it."""
     key: Ed25519PrivateKey | None = field(default=None, compare=False, repr=False)
 
+    def expires_s(self) -> float:
+        """When its token ends [garden s], as the token itself says."""
+        return float(jwt.decode(self.token, options={"verify_signature": False, "verify_exp": False})["exp"])
+
     @classmethod
     def load(cls, folder: Path) -> Identity:
         """Read `folder/token`, and `card` and `node.key` where they are; raises ConfigError when there is no token."""

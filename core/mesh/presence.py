@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from fastapi import FastAPI, Query
 
 from core.clock import Clock
 from core.errors import NotFound
 from core.mesh.auth import Identity
 from core.mesh.introduction import NONCE_CHARS, Introducer, Introduction
+from core.mesh.metrics import Reading, measure
 from core.mesh.peers import Contact, PeerKind, Peers
 from core.wire.documents import Document, Identifier
 
@@ -28,9 +31,11 @@ class SeenPeer(Document):
     """Who passes requests on to it, itself the last; empty: it is asked directly."""
 
 
-def add_presence(app: FastAPI, peers: Peers, clock: Clock, introducer: Introducer | None) -> None:
-    """`GET /peers` and `GET /introduction`; `/readyz` tells where peers come from."""
+def add_presence(app: FastAPI, peers: Peers, clock: Clock, identity: Identity | None, kind: str, url: str) -> None:
+    """`GET /peers` and `GET /introduction`; `/readyz` tells where peers come from, `/metrics` how many there are."""
     app.state.peers = peers
+    me = introducer(identity, kind, url)
+    measure(app.state.registry, lambda: _readings(peers, identity, clock))
 
     @app.get("/peers", summary="Who else is known here, and how far away", tags=["node"])
     async def known() -> list[SeenPeer]:
@@ -38,9 +43,9 @@ def add_presence(app: FastAPI, peers: Peers, clock: Clock, introducer: Introduce
 
     @app.get("/introduction", summary="Prove to a stranger who answers here", tags=["node"])
     async def introduction(nonce: str = Query(min_length=NONCE_CHARS[0], max_length=NONCE_CHARS[1])) -> Introduction:
-        if introducer is None:
+        if me is None:
             raise NotFound("this node has no card", hint="run `garden init` again and give the node its own URL")
-        return introducer.introduce(nonce)
+        return me.introduce(nonce)
 
 
 def introducer(identity: Identity | None, kind: str, url: str) -> Introducer | None:
@@ -48,6 +53,17 @@ def introducer(identity: Identity | None, kind: str, url: str) -> Introducer | N
     if identity is None or identity.key is None or not identity.card or not url:
         return None
     return Introducer(identity.subject, kind, url, identity.card, identity.key)
+
+
+def _readings(peers: Peers, identity: Identity | None, clock: Clock) -> Iterator[Reading]:
+    contacts = peers.contacts()
+    for present in (True, False):
+        count = sum(contact.present is present for contact in contacts)
+        labels = {"present": str(present).lower()}
+        yield Reading("garden_peers", "Peers ever met, by whether they are there now", count, labels)
+    if identity is not None:
+        left_s = identity.expires_s() - clock.now()
+        yield Reading("garden_token_left_seconds", "Until this node's own token ends", left_s)
 
 
 def _told(contact: Contact, now_s: float) -> SeenPeer:

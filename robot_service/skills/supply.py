@@ -65,11 +65,13 @@ def chargers(known: list[KnownDock], travel: Travel) -> list[KnownDock]:
 
 
 async def refill(robot: Robot, docks: Docks, travel: Travel) -> None:
-    """Dock at the nearest tap and fill the tank by its own sensor."""
-    times = {dock.name: travel("here", dock.name) for dock in robot.settings.map.docks if dock.tap}
+    """Dock at the nearest tap that is not known to be dry, and fill the tank by its own sensor."""
+    docks_of_taps = [dock.name for dock in robot.settings.map.docks if dock.tap]
+    times = {name: travel("here", name) for name in docks_of_taps if not robot.fitness.why_not(name)}
     taps = sorted((time_s, name) for name, time_s in times.items() if time_s is not None)
     if not taps:
-        raise SkillFailed("no tap can be reached")
+        dry = [why for name in docks_of_taps if (why := robot.fitness.why_not(name))]
+        raise SkillFailed("; ".join(dry) or "no tap can be reached")
     dock = robot.dock(taps[0][1])
     await dock_at(robot, docks, dock.name)
     robot.activity.job = "refill"
@@ -92,9 +94,12 @@ async def _fill(robot: Robot, dock: KnownDock) -> None:
             risen_s = robot.clock.now()
         level_ml = max(level_ml, now_ml)
         if robot.clock.now() - risen_s > TAP_STALL_S:
-            raise SkillFailed(dry or f"the tank does not fill beyond {level_ml:.0f} ml")
+            why = dry or f"the tank does not fill beyond {level_ml:.0f} ml"
+            robot.fitness.failed(dock.name, f"no water at {dock.name}: {why}")
+            raise SkillFailed(why)
         if grant is not None:
             open_s = min(30.0, max(0.5, (AIM_ML - level_ml) / grant.flow_mlps))
+    robot.fitness.worked(dock.name)
 
 
 async def _open(robot: Robot, dock: KnownDock, open_s: float) -> TapGrant:

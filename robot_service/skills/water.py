@@ -14,6 +14,7 @@ from core.manipulation.swing import Leg
 from core.robots import gardener
 from core.wire.fruit import Fruit
 from core.wire.market import Permit, PlantCard
+from robot_service.fitness import PUMP
 from robot_service.robot import Robot, SkillFailed
 from robot_service.skills.arm import fold_arm, move_arm, reach, withdraw
 from robot_service.skills.hand import FAST_SHARE, Grip, go_along, swing_to
@@ -41,6 +42,8 @@ class Poured:
 
     delivered_ml: float = 0.0
     why: str = ""
+    pump_failed: bool = False
+    """The pump is why."""
 
 
 async def water(
@@ -56,6 +59,10 @@ async def water(
     await _pour(robot, permit, asked_s, poured)
     await _drip(robot, DRIP_S)
     _believe(poured, full_ml, robot.state().tank_ml)
+    if poured.pump_failed:
+        robot.fitness.failed(PUMP, f"the pump has failed: {poured.why}")
+    elif not poured.why:
+        robot.fitness.worked(PUMP)
     await fold_arm(robot)
 
 
@@ -89,6 +96,7 @@ def _believe(poured: Poured, before_ml: float | None, after_ml: float | None) ->
     if gone_ml < poured.delivered_ml / 2:
         said_ml, poured.delivered_ml = poured.delivered_ml, gone_ml
         poured.why = f"the pump ran for {said_ml:.0f} ml, but the tank's level fell by {gone_ml:.0f} ml"
+        poured.pump_failed = True
 
 
 async def _pour(robot: Robot, permit: Permit, asked_s: float, poured: Poured) -> None:
@@ -111,6 +119,7 @@ async def _pour(robot: Robot, permit: Permit, asked_s: float, poured: Poured) ->
             return
         if robot.clock.now() - grown_s > STALL_S or robot.clock.now() - began_s > longest_s:
             poured.why = f"the pump stopped at {poured.delivered_ml:.0f} ml: {state.refusal or 'no more came'}"
+            poured.pump_failed = state.docked and not state.refusal
             return
         if state.tank_ml is not None and state.tank_ml < DRY_ML:
             poured.why = f"the tank ran dry after {poured.delivered_ml:.0f} ml"

@@ -6,6 +6,7 @@ import asyncio
 import re
 from pathlib import Path
 
+from core.mesh.auth import TOKEN_LIFE_S
 from core.mesh.metrics import LoopLag
 from lab import story
 from lab.garden import Garden
@@ -50,6 +51,9 @@ def test_the_list_holds_what_the_services_tell_and_a_watering_moves_a_robots_num
         assert before["garden_queue_length"] == before["garden_queue_running"] == before["garden_position_known"] == 1
         assert before["garden_estop_latched"] == before["garden_charging"] == before["garden_body_down"] == 0
         assert before["garden_docks_held"] == 1
+        assert before["garden_parts_failed"] == 0
+        assert before['garden_peers{present="true"}'] > 0 == before['garden_peers{present="false"}']
+        assert 0 < before["garden_token_left_seconds"] <= TOKEN_LIFE_S
         assert before["garden_position_sigma_m"] > 0
         await story.phase(garden, "plant-1", "act")
         assert (await told("robot-1"))["garden_charging"] == 1

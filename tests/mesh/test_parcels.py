@@ -97,7 +97,7 @@ class Air:
         app = create_app(card=lambda: NodeCard(id=id, kind=kind), clock=self.clock, verifier=verifier, ready=list)
         me = introducer(identity, kind, self.urls[id])
         assert me is not None
-        add_presence(app, peers, self.clock, me)
+        add_presence(app, peers, self.clock, identity, kind, self.urls[id])
         host = Host(id, self.clock, app, relay, courier, mesh, peers, identity, me, way_out=transport)
         routes(host)
         host.courier.join(me, app)

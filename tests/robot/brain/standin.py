@@ -371,7 +371,7 @@ class FakeStation:
         self.docks = Docks("station", ids, None, clock.now())
         self.app = _app("station", "station", clock, verifier)
         _dock_routes(self.app, self.docks, clock)
-        self.taps = 0
+        self.taps, self.dry = 0, False
 
         @self.app.post("/tap")
         async def tap(wish: TapRequest = body(TapRequest), caller: object = allow("robot")) -> TapGrant:
@@ -380,8 +380,9 @@ class FakeStation:
             if wish.robot_id in plane.filling:
                 raise Conflict("the tap is open")
             self.taps += 1
-            plane.filling.add(wish.robot_id)
-            asyncio.get_running_loop().call_later(wish.open_s, plane.filling.discard, wish.robot_id)
+            if not self.dry:
+                plane.filling.add(wish.robot_id)
+                asyncio.get_running_loop().call_later(wish.open_s, plane.filling.discard, wish.robot_id)
             return TapGrant(open_s=wish.open_s, flow_mlps=TAP_MLPS)
 
 

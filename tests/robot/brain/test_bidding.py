@@ -192,6 +192,7 @@ def test_a_nearly_empty_pack_is_charged_first_and_paid_for():
     ("change", "word"),
     [
         ({"can": frozenset({"charge"})}, "no pump"),
+        ({"unfit": {"water": "the pump has failed"}}, "the pump has failed"),
         ({"stopped_by": "operator"}, "stopped by operator"),
         ({"down": ("base: silent",)}, "base: silent"),
         ({"lost": "lost: no markers"}, "lost"),
@@ -205,6 +206,10 @@ def test_whoever_cannot_says_why(change, word):
     bid = price(asked(), replace(ME, **change))
     assert bid.cost_s is None
     assert word in bid.reason
+
+
+def test_who_is_unfit_for_one_kind_takes_others():
+    assert price(asked(), replace(ME, unfit={"inventory": "the eye is dirty"})) == price(asked(), ME)
 
 
 def test_an_unreachable_dock_is_refused():

@@ -8,6 +8,7 @@ from core.geometry.planar import distance_m
 from core.robots import gardener
 from core.wire.market import ReservationRequest
 from core.wire.robot import JobRequest, ResumeRequest, StopRequest
+from robot_service.fitness import AGAIN_S
 
 
 def poured(garden, plant, robot="robot-1"):
@@ -376,6 +377,92 @@ def test_a_stuck_pump_is_reported_with_what_came_out():
         assert plant.ended.state == "failed"
         assert plant.ended.delivered_ml == pytest.approx(poured(garden, "plant-1"), abs=0.5)
         assert "pump" in plant.ended.reason
+
+    in_garden(story)
+
+
+def test_with_a_broken_pump_what_waits_is_given_back_with_the_reason_and_no_water_is_promised():
+    async def story(garden):
+        brain, body = garden.brains["robot-1"], garden.bodies["robot-1"]
+        body.pump_stuck = True
+        for number, name in enumerate(("plant-1", "plant-2", "plant-3"), 1):
+            await garden.award(name, number=number)
+        waiting = [garden.plants[name] for name in ("plant-2", "plant-3")]
+        await garden.until(lambda: all(plant.ended for plant in waiting), 120.0)
+        assert garden.plants["plant-1"].ended.state == "failed"
+        for plant in waiting:
+            assert plant.ended.state == "failed"
+            assert plant.ended.reason.startswith("the pump has failed: the pump stopped at 0 ml")
+            assert not plant.permits, "it was not even driven to"
+        assert not brain.queue.entries
+        assert "the pump has failed" in (await garden.bid("plant-1")).reason
+        assert any("the pump has failed" in why for why in brain.state().down)
+
+    in_garden(story)
+
+
+def test_a_pump_that_failed_is_tried_again_after_a_while_ever_more_seldom():
+    async def story(garden):
+        body = garden.bodies["robot-1"]
+        body.pump_stuck = True
+        for number, rest_s in ((1, AGAIN_S), (2, 2 * AGAIN_S)):
+            garden.plants["plant-1"].reports.clear()
+            await garden.award("plant-1", number=number)
+            await garden.until(lambda: garden.plants["plant-1"].ended, 120.0)
+            await garden.clock.sleep(rest_s - 40.0)  # it folded its arm first
+            assert (await garden.bid("plant-1")).cost_s is None
+            await garden.clock.sleep(40.0)
+            assert (await garden.bid("plant-1")).cost_s is not None
+        body.pump_stuck = False
+        garden.plants["plant-1"].reports.clear()
+        await garden.award("plant-1", number=3)
+        await garden.until(lambda: garden.plants["plant-1"].ended, 120.0)
+        assert garden.plants["plant-1"].ended.state == "done"
+        assert not garden.brains["robot-1"].state().down
+
+    in_garden(story)
+
+
+def test_whoever_releases_a_robot_has_looked_at_its_pump():
+    async def story(garden):
+        body = garden.bodies["robot-1"]
+        body.pump_stuck = True
+        await garden.award("plant-1")
+        await garden.until(lambda: garden.plants["plant-1"].ended, 120.0)
+        assert (await garden.bid("plant-1")).cost_s is None
+        body.stopped, body.stopped_by = True, "operator"
+        await garden.clock.sleep(1.0)
+        body.stopped, body.pump_stuck = False, False
+        await garden.clock.sleep(1.0)
+        assert (await garden.bid("plant-1")).cost_s is not None
+
+    in_garden(story)
+
+
+def test_at_a_dry_tap_what_there_is_water_for_stays_and_the_rest_is_given_back_with_the_reason():
+    async def story(garden):
+        brain = garden.brains["robot-1"]
+        garden.station.dry = True
+        garden.bodies["robot-1"].tank_ml = 60.0
+        await garden.clock.sleep(1.0)
+        await garden.award("plant-1", number=1)
+        await garden.award("plant-2", number=2)
+        gone = [garden.plants[name] for name in ("plant-1", "plant-2")]
+        await garden.until(lambda: all(plant.ended for plant in gone), 200.0)
+        for plant in gone:
+            assert plant.ended.state == "failed"
+            assert plant.ended.reason.startswith("no water at station/tap: the tank does not fill"), plant.ended
+            assert not plant.permits
+        assert not brain.queue.entries
+        refused = await garden.bid("plant-1")
+        assert refused.cost_s is None
+        assert "no tap" in refused.reason
+        assert (await garden.bid("plant-1", dose_ml=20.0)).cost_s is not None
+        garden.station.dry = False
+        await garden.clock.sleep(AGAIN_S)
+        bid = await garden.bid("plant-1")
+        assert bid.cost_s is not None
+        assert bid.breakdown.refill_s > 30.0
 
     in_garden(story)
 
