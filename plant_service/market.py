@@ -16,6 +16,7 @@ from core.clock import Clock
 from core.errors import GardenError, Overtaken, PeerDown, StorageError
 from core.mesh.client import ROBOTS, Answer, Mesh
 from core.mesh.peers import Peers
+from core.mesh.plain import check
 from core.wire.documents import Problem
 from core.wire.market import Bid
 from plant_service.journal import Journal
@@ -153,6 +154,7 @@ def _reason(answer: Answer) -> str:
 def _problem(answer: Answer) -> Problem:
     """What a refusal says; a made-up one when it says nothing that we understand."""
     try:
+        check(answer.body)
         return Problem.model_validate_json(answer.body)
     except ValueError:
         return Problem(title="", status=answer.status, detail=f"status {answer.status}")

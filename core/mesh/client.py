@@ -29,6 +29,7 @@ from core.errors import (
 )
 from core.mesh.auth import Identity
 from core.mesh.peers import Peer
+from core.mesh.plain import check
 from core.wire.documents import Document, Problem
 
 if TYPE_CHECKING:
@@ -280,6 +281,7 @@ def read(peer: Peer, answer: Answer, expect: type[D]) -> D:
     if len(answer.body) > ANSWER_BYTES_MAX:
         raise PeerDown(f"{peer.id} answered with {len(answer.body)} bytes, more than we read")
     try:
+        check(answer.body)
         value: D = _adapter(cast(Any, expect)).validate_json(answer.body)
     except (ValidationError, ValueError) as error:
         raise PeerDown(f"{peer.id} answered something else than expected: {str(error)[:200]}") from error
@@ -303,8 +305,9 @@ _ERRORS: dict[int, type[GardenError]] = {
 def _error(peer: Peer, answer: Answer) -> GardenError:
     """The error a problem document stands for; its `status` is the answer's."""
     try:
+        check(answer.body)
         problem = Problem.model_validate_json(answer.body)
-    except ValidationError:
+    except (ValidationError, ValueError):
         problem = Problem(title="", status=answer.status, detail=f"{peer.id} answered {answer.status} without saying why")
     cls = Refused if problem.title == Refused.title else _ERRORS.get(answer.status)
     if cls is None:

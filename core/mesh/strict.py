@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any, TypeVar
 
 from fastapi import Depends, Request
 from pydantic import BaseModel, ValidationError
 
 from core.errors import BadRequest, Unprocessable
+from core.mesh.plain import NotFinite, check
 
 M = TypeVar("M", bound=BaseModel)
-DEPTH_MAX = 32
 _READS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
@@ -52,7 +51,10 @@ class RawReader:
 
 
 def parse(model: type[M], raw: bytes, hint: str = "") -> M:
-    """One document from bytes; raises BadRequest for what is not JSON, Unprocessable for what is not this document."""
+    """One document from bytes; raises BadRequest for what is not JSON, Unprocessable for what is not this document.
+
+    NaN, infinities and numbers too large for a float are not JSON either, but it is clear what they are: Unprocessable.
+    """
     _check_json(raw)
     try:
         return model.model_validate_json(raw, strict=True)
@@ -69,58 +71,14 @@ def _told(error: ValidationError) -> str:
 
 
 def _check_json(raw: bytes) -> None:
-    """What pydantic's parser lets pass: doubled keys, NaN, numbers beyond a float, bottomless nesting."""
     if not raw:
         raise BadRequest("the body is empty", hint="send a JSON object")
     try:
-        value = _DECODER.decode(raw.decode("utf-8"))
-    except RecursionError:
-        raise BadRequest("the body is nested too deeply") from None
-    except UnicodeDecodeError:
-        raise BadRequest("the body is not UTF-8") from None
+        check(raw)
+    except NotFinite as error:
+        raise Unprocessable(f"a number in the body cannot be: {error}"[:300]) from None
     except ValueError as error:
-        raise BadRequest(f"the body is not JSON: {error}"[:300]) from None
-    if raw.count(b"{") + raw.count(b"[") > DEPTH_MAX and _deeper(value, DEPTH_MAX):
-        raise BadRequest(f"the body is nested more than {DEPTH_MAX} deep")
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    document = dict(pairs)
-    if len(document) != len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the key {twice[:40]!r} comes twice")
-    return document
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if value in (float("inf"), float("-inf")):
-        raise ValueError(f"{text[:40]} is too large")
-    return value
-
-
-_DECODER = json.JSONDecoder(object_pairs_hook=_once, parse_constant=_no_constant, parse_float=_finite)
-
-
-def _deeper(value: Any, depth: int) -> bool:
-    """Whether containers in `value` nest more than `depth` deep."""
-    level = [value]
-    for _ in range(depth):
-        level = [inner for item in level for inner in _inside(item)]
-        if not level:
-            return False
-    return any(isinstance(item, dict | list) for item in level)
-
-
-def _inside(item: Any) -> list[Any]:
-    if isinstance(item, dict):
-        return list(item.values())
-    return item if isinstance(item, list) else []
+        raise BadRequest(f"the body is not JSON as it should be: {error}"[:300]) from None
 
 
 async def plain_read(request: Request) -> None:

@@ -24,9 +24,11 @@ function allow(string ...$roles): array
 
 function document(): mixed
 {
+    $body = (string) file_get_contents('php://input', length: 65537);
     try {
-        return json_decode((string) file_get_contents('php://input', length: 65537), true, 32, JSON_THROW_ON_ERROR);
+        return json_decode($body, true, 32, JSON_THROW_ON_ERROR);
     } catch (JsonException $error) {
+        if (preg_match('/(^|[:,[])\s*-?(NaN|Infinity)\s*($|[],}])/', $body)) throw new Refusal(422, 'a number is not finite');
         throw new Refusal(400, "the body is not JSON: {$error->getMessage()}");
     }
 }

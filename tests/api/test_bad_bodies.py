@@ -10,9 +10,14 @@ from typing import Any
 import pytest
 from doors import Doors, Operation, check_problem, open_doors
 
+from core.errors import BadRequest, GardenError, PeerDown, Unprocessable
 from core.mesh.auth import Identity
+from core.mesh.client import Answer, read
 from core.mesh.parcels import EVERYBODY, sealed
+from core.mesh.peers import Peer
 from core.mesh.presence import introducer
+from core.mesh.strict import parse
+from core.wire.market import Bid
 
 POSE = {"x_m": 0.1, "y_m": 0.2, "yaw_rad": 0.3}
 CARD = {
@@ -365,3 +370,33 @@ def test_the_good_bodies_are_taken_and_change_something(tmp_path: Path) -> None:
             "robot/jobs",
             "sim/faults",
         }
+
+
+BID = {
+    "task_id": "plant-1:9:9", "robot_id": "robot-1", "cost_s": 30.5, "reason": "", "breakdown": {
+        "current_s": 0.0, "queue_s": 1.0, "travel_s": 9.5, "work_s": 20.0, "charge_s": 0.0, "refill_s": 0.0, "delay_s": 0.0,
+    },
+}  # fmt: skip
+
+
+def test_what_is_refused_as_a_request_is_refused_as_an_answer() -> None:
+    robot = Peer(id="robot-1", kind="robot", url="http://robot-1")
+    assert read(robot, Answer(200, json.dumps(BID).encode()), Bid).cost_s == 30.5
+    texts = [*one_place_wrong(BID), *one_field_wrong(BID), '{"cost_s": 9, "cost_s": 1}']
+    bodies = [text.encode() for text in texts] + list(not_documents(BID))
+    assert len(bodies) > 150
+    for body in bodies:
+        with pytest.raises((BadRequest, Unprocessable)):
+            parse(Bid, body)
+        with pytest.raises(PeerDown):
+            read(robot, Answer(200, body), Bid)
+        with pytest.raises(GardenError, match="without saying why"):
+            read(robot, Answer(409, body), Bid)
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e400", "-1e400", "9" * 400, "-" + "9" * 5000])
+def test_a_number_that_no_float_holds_is_422(doors: Doors, number: str) -> None:
+    for each in takers(doors):
+        good = GOOD[each.key]
+        ways = [way for way, value in leaves(good) if isinstance(value, int | float) and not isinstance(value, bool)]
+        refused(doors, each, [number, *(put(good, way, number) for way in ways)], 422)

@@ -350,8 +350,9 @@ def test_a_document_that_is_not_the_protocols_is_refused_and_changes_nothing(pot
     before = pot.task()
     good = {"robot_id": "robot-1", "epoch": 1, "state": "running"}
     bodies = {422: ["[]", "{}", '"x"', *({**good, **wrong} for wrong in (
-        {"more": 1}, {"epoch": "1"}, {"epoch": True}, {"state": "asleep"}, {"progress": 2}, {"phase": "x" * 501}))],
-        400: ["", "{", "{}{}", '{"robot_id": NaN}', "\xff"], 413: ["[" + "0," * 40000 + "0]"]}  # fmt: skip
+        {"more": 1}, {"epoch": "1"}, {"epoch": True}, {"state": "asleep"}, {"progress": 2}, {"phase": "x" * 501})),
+        "NaN", '{"robot_id": NaN}', '{"epoch": [-Infinity]}', json.dumps(good)[:-1] + ', "progress": 1e999}'],
+        400: ["", "{", "{}{}", "\xff"], 413: ["[" + "0," * 40000 + "0]"]}  # fmt: skip
     for status, wrong in bodies.items():
         for body in wrong:
             content = body.encode("latin-1") if isinstance(body, str) else json.dumps(body).encode()

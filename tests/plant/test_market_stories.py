@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
+
+import pytest
+
+from core.mesh.client import Answer
 
 Play = Any
 Garden = Any
@@ -72,6 +77,30 @@ def test_nobody_able_is_said_with_reasons_and_asked_for_again(play: Play) -> Non
         dry.cost = lambda _: 5.0
         done = await garden.until_task("done")
         assert done["robot_id"] == "robot-1"
+
+    play(story)
+
+
+@pytest.mark.parametrize("cost", ['9.0, "cost_s": 1.0', "NaN", "1e999", '"1"', "-1.0"])
+def test_a_price_that_is_not_plain_json_is_no_bid_and_the_others_go_on(play: Play, cost: str) -> None:
+    async def story(garden: Garden) -> None:
+        liar, honest = garden.robot("robot-1"), garden.robot("robot-2", 60.0)
+        said = liar.answer
+
+        async def answer(method: str, path: str, body: bytes) -> Answer:
+            if path != "/bids":
+                return await said(method, path, body)
+            task_id = json.loads(body)["task_id"]
+            return Answer(200, f'{{"task_id": "{task_id}", "robot_id": "robot-1", "cost_s": {cost}}}'.encode())
+
+        liar.answer = answer
+        garden.pot(ratio=0.195)
+        task = await garden.until_task("running")
+        assert task["robot_id"] == "robot-2"
+        bids = {bid["robot_id"]: bid for bid in task["rounds"][0]["bids"]}
+        assert (bids["robot-1"]["cost_s"], bids["robot-2"]["cost_s"]) == (None, 60.0)
+        assert honest.epochs
+        assert not liar.epochs
 
     play(story)
 
