@@ -48,6 +48,8 @@ class GardenSettings(BaseSettings):
     """How peers are found beside that list, separated by commas."""
     discovery_port: Annotated[int, Field(ge=1, le=65535)] = 8100
     """Where the service of every host listens that a routing table names."""
+    hop_protocols: Annotated[tuple[Annotated[int, Field(ge=1, le=255)], ...], NoDecode] = (42,)
+    """Kernel route protocols, separated by commas, whose metric counts hops: babeld's; olsrd's is the one it is given."""
     hops_max: Annotated[int, Field(ge=1, le=255)] = 255
     """Robots and plants farther away are not asked."""
     flood_hops: Annotated[int, Field(ge=0, le=16)] = 0
@@ -61,7 +63,7 @@ class GardenSettings(BaseSettings):
     """Reading needs no token. Right only while the port is published on loopback."""
     seed: int = 0
 
-    @field_validator("discovery", mode="before")
+    @field_validator("discovery", "hop_protocols", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
@@ -228,7 +230,7 @@ def finding(runtime: Runtime, node: Node) -> Sequence[Loop]:
         raise ConfigError(f"{node.id} does not know its own URL, so nobody can find it", hint="set PLANT_URL or ROBOT_URL")
     made: dict[str, Source] = {
         "mdns": MulticastDns(node.id, node.kind, node.url),
-        "routes": KernelRoutes(runtime.clock, settings.discovery_port, urlsplit(node.url).scheme),
+        "routes": KernelRoutes(runtime.clock, settings.discovery_port, urlsplit(node.url).scheme, settings.hop_protocols),
     }
     # With the time, so that no number drawn in a former life is drawn again: answers to it may have been kept.
     rng = Random(f"{settings.seed}:{node.id}:{runtime.clock.now()}")

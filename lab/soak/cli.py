@@ -57,7 +57,7 @@ def soak_command(
         faults = sum(outcome.faults.values())
         tell.print(f"{ended}/{seeds} seed {outcome.seed}: {outcome.tally.tasks} tasks, {faults} faults{broken}")
         for line in _lines(outcome):
-            tell.print(line, highlight=False, markup=False)
+            tell.print(line, highlight=False, markup=False, soft_wrap=True)
 
     outcomes = soak_all(plans, jobs or len(os.sched_getaffinity(0)), told)
     document = as_json(outcomes)

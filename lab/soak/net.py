@@ -11,6 +11,7 @@ import random
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
+from hashlib import sha256
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -68,6 +69,7 @@ class SoakMesh:
         self.weather = CLEAR
         self.cut: set[tuple[str, str]] = set()
         self.requests = 0
+        self._trace = sha256()
         self.touched: Callable[[Message], None] = lambda message: None
         """A fault met a message."""
         self.sent: Callable[[Message], None] = lambda message: None
@@ -83,6 +85,10 @@ class SoakMesh:
         """Asked of every request: how long just this one is kept on its way."""
         self.at_hand: Callable[[Message, Answer], None] = lambda message, answer: None
         """The answer has come, and who asked has not read it yet."""
+
+    def trace(self) -> str:
+        """A digest of every request so far: when, from whom, to whom, and every byte of what was said."""
+        return self._trace.hexdigest()
 
     def attach(self, name: str, netloc: str, life: Life, app: Asgi) -> None:
         self._hosts[netloc] = Host(life, app)
@@ -101,6 +107,7 @@ class SoakMesh:
         self.requests += 1
         message = Message(self.requests, life.name, target, method, path, body, headers.get("idempotency-key", ""))
         done: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._trace.update(f"{asyncio.get_running_loop().time():.6f} {life.name} {target} {method} {path} ".encode() + body)
         self.sent(message)
         if self.worst(message, None):
             return await done

@@ -7,14 +7,17 @@ import gc
 import json
 import logging
 import random
+import subprocess
 import tempfile
 import warnings
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 
+from core.mesh.chassis import version
 from core.mesh.client import Answer
 from core.robots.garden_map import map_of
 from core.scenario import Scenario, find
@@ -35,6 +38,17 @@ SIZES = ((1, 1), (2, 1), (2, 2), (3, 2), (3, 2), (4, 2))
 """Pots and robots of a garden; the seed chooses."""
 
 
+@cache
+def code() -> str:
+    """`commit 39ea6d0`, with `+ changes` where files differ from it; the version where there is no repository."""
+    try:
+        told = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=10", "--exclude=*", "--dirty=+"]
+        found = subprocess.run(told, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return f"version {version()}"
+    return f"commit {found.removesuffix('+')}" + (" + changes" if found.endswith("+") else "")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """What one seed means."""
@@ -48,8 +62,9 @@ class Plan:
     """End at the first broken invariant."""
 
     def replay(self) -> str:
+        """The line that lives through the same garden again, and the code that it belongs to."""
         hurry = f" --hurry {self.hurry:g}" if self.hurry != 1.0 else ""
-        return f"garden soak --days {self.days:g}{hurry} --seeds 1 --seed {self.seed}"
+        return f"garden soak --days {self.days:g}{hurry} --seeds 1 --seed {self.seed}  # {code()}"
 
 
 @dataclass(slots=True)
@@ -62,6 +77,7 @@ class Outcome:
     faults: dict[str, int] = field(default_factory=dict)
     breaches: list[Breach] = field(default_factory=list)
     trace: str = ""
+    """A digest of all that was said and of what became of water and fruit."""
 
 
 def soak(plan: Plan, told: Callable[[float], None] = lambda share: None) -> Outcome:
@@ -137,7 +153,7 @@ async def _soak(plan: Plan, folder: Path, told: Callable[[float], None]) -> Outc
         garden.kill(name)
     with suppress(asyncio.CancelledError):
         await asyncio.sleep(1.0)
-    trace = f"{judge.tally.requests}/{truth.now():.6f}/{sum(d.ml for d in truth.doses):.6f}/{truth.picks}"
+    trace = f"{garden.mesh.trace()}/{truth.now():.6f}/{sum(d.ml for d in truth.doses):.6f}/{truth.picks}"
     return Outcome(plan.seed, plan, judge.tally, dict(sorted(counts.items())), judge.breaches, trace)
 
 

@@ -10,6 +10,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import jwt
 import pytest
+from pydantic import ValidationError
 
 from core.clock import VirtualClock
 from core.errors import Unauthorised
@@ -19,7 +20,8 @@ from core.mesh.discovery import AGAIN_S, MISSED_AGAIN_S, MISSES_MAX, Discovery, 
 from core.mesh.introduction import Introducer, met
 from core.mesh.peers import Peer, Peers
 from core.mesh.presence import introducer
-from core.mesh.routes import hosts
+from core.mesh.routes import BABELD, hosts
+from core.mesh.runtime import GardenSettings
 from core.virtual import run_virtual
 
 NONCE = "0123456789abcdef"
@@ -249,6 +251,20 @@ def test_whoever_is_farther_than_the_hop_limit_is_not_asked() -> None:
 
 def route(dst: str, metric: int, proto: int = 42, kind: int = 1, bits: int = 32) -> dict[str, object]:
     return {"proto": proto, "type": kind, "dst_len": bits, "attrs": [("RTA_DST", dst), ("RTA_PRIORITY", metric)]}
+
+
+def test_olsrds_routes_count_under_the_protocol_number_that_it_was_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = [route("10.0.0.2", 1, proto=100), route("10.0.0.3", 3, proto=100), route("10.0.0.4", 2, proto=3)]
+    monkeypatch.setenv("GARDEN_HOP_PROTOCOLS", "42, 100")
+    known = GardenSettings().hop_protocols
+    assert known == (42, 100)
+    assert hosts(table, 8100, protocols=known) == [Hint("http://10.0.0.2:8100", 1), Hint("http://10.0.0.3:8100", 3)]
+    assert hosts(table, 8100) == []
+    monkeypatch.delenv("GARDEN_HOP_PROTOCOLS")
+    assert GardenSettings().hop_protocols == (BABELD,)
+    monkeypatch.setenv("GARDEN_HOP_PROTOCOLS", "olsrd")
+    with pytest.raises(ValidationError):
+        GardenSettings()
 
 
 def test_only_host_routes_of_a_mesh_daemon_count_hops() -> None:

@@ -1,18 +1,11 @@
 """A test of the tests: every mistake of `bugs` must be found by the soak, soon."""
 
-import importlib.util
-from pathlib import Path
 from statistics import median
 
+import bugs
 import pytest
 
 from lab.soak.run import Plan, soak
-
-_spec = importlib.util.spec_from_file_location("soak_bugs", Path(__file__).with_name("bugs.py"))
-assert _spec is not None
-assert _spec.loader is not None
-bugs = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(bugs)
 
 SEEDS_MAX = 200
 QUICK = ("acknowledged_before_fsync", "a_repeated_award_is_keyed_and_differs")

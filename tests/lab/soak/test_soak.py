@@ -2,14 +2,23 @@
 
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
+import bugs
 import pytest
+import typer
+from typer.testing import CliRunner
 
-from lab.soak.cli import soak_all
+from lab.soak.cli import soak_all, soak_command
 from lab.soak.run import Plan, as_json, soak
 
+DOC = (Path(__file__).resolve().parents[3] / "docs" / "reliability.md").read_text()
+APP = typer.Typer()
+APP.command()(soak_command)
 FIVE_DAYS = [Plan(seed=seed, days=1.0, hurry=0.3) for seed in range(1, 6)]
 
 
@@ -32,9 +41,32 @@ def _output(script, env):
 
 
 def test_a_garden_is_a_function_of_its_seed():
-    script = "from lab.soak.run import *; o = soak(Plan(seed=3, days=0.01, hurry=2.0)); print(o.trace, o.faults)"
-    runs = [_output(script, os.environ | {"PYTHONHASHSEED": seed}) for seed in ("1", "2")]
-    assert runs[0] == runs[1] != ""
+    """Every byte that was said, in processes that hash differently."""
+    script = "from lab.soak.run import *; o = soak(Plan(seed={}, days=0.01, hurry=2.0)); print(o.trace, o.faults)"
+    runs = [_output(script.format(3), os.environ | {"PYTHONHASHSEED": seed}) for seed in ("1", "2", "3")]
+    assert runs[0] == runs[1] == runs[2] != ""
+    assert len(runs[0].partition("/")[0]) == 64
+    assert soak(Plan(seed=4, days=0.01, hurry=2.0)).trace not in runs[0]
+
+
+def test_a_broken_invariant_comes_with_a_line_that_breaks_it_again():
+    with bugs.BUGS["acknowledged_before_fsync"]():
+        words = ["--days", "0.05", "--hurry", "3", "--seeds", "1", "--jobs", "1", "--json"]
+        first = next(found for seed in range(1, 4) if (found := _soaked(*words, "--seed", str(seed))).exit_code)
+        document = json.loads(first.stdout)
+        assert set(document) >= {"simulated_days", "seeds", "tasks", "faults", "broken_invariants", "replay"}
+        assert document["broken_invariants"] == len(document["broken"]) >= 1
+        (line,) = document["replay"]
+        command, _, code = line.partition("  # ")
+        assert re.fullmatch(r"commit [0-9a-f]{10,}( \+ changes)?|version \S+", code)
+        again = _soaked(*shlex.split(command)[2:], "--jobs", "1", "--json")
+        assert again.exit_code == 1
+        assert json.loads(again.stdout) == document
+        assert line in first.stderr
+
+
+def _soaked(*words):
+    return CliRunner().invoke(APP, list(words))
 
 
 def test_the_report_counts_days_seeds_faults_and_tells_how_to_replay_what_broke():
@@ -51,9 +83,28 @@ def test_the_report_counts_days_seeds_faults_and_tells_how_to_replay_what_broke(
 def test_thirty_days_over_fresh_seeds_break_nothing():
     outcomes = soak_all([Plan(seed=seed, days=0.5) for seed in range(1001, 1061)], 2, lambda outcome: print(outcome.seed))
     assert not any(outcome.breaches for outcome in outcomes), "\n".join(map(told, outcomes))
+    document = as_json(outcomes)
+    print(json.dumps(document))
+    assert document["tasks"] > 1000 < document["doses"] + document["picks"]
+    assert _named_faults() <= set(document["faults"]), "a fault of docs/reliability.md did not strike once"
+
+
+def _named_faults():
+    """What docs/reliability.md calls the worst instants."""
+    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", DOC, re.MULTILINE)
+    return {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+
+
+def test_the_worst_instants_are_named():
+    assert len(_named_faults()) >= 20
 
 
 @pytest.mark.soak
 def test_six_weeks_of_one_garden_break_nothing():
     outcome = soak(Plan(seed=42, days=42.0))
+    print(json.dumps(as_json([outcome])))
     assert not outcome.breaches, told(outcome)
+    assert outcome.tally.done > 1000
+    assert outcome.tally.doses > 300
+    assert outcome.tally.picks > 100
+    assert sum(outcome.faults.values()) > 10_000
