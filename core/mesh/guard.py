@@ -11,6 +11,7 @@ from typing import cast
 
 import structlog
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from core.clock import Clock
@@ -134,6 +135,8 @@ class Guard:
             await self._answer(scope, receive, counted)
         except GardenError as error:
             await self._refuse(scope, receive, counted, error, begun=status != 0)
+        except ClientDisconnect:
+            status = status or 408  # the body never came in whole; nobody is there to hear so
         except Exception:
             _log.exception("request failed", method=scope["method"], path=scope["path"])
             await self._refuse(scope, receive, counted, BROKEN, begun=status != 0)
