@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from core.mesh.auth import Enrolled
 from core.mesh.peers import Peer, PeerKind
 from core.robots import gardener
+from core.robots.fence import fence_of
 from core.robots.garden_map import map_of
 from core.scenario import Plant, Robot, Scenario, device_ports
 from core.wire.geometry import Point3
@@ -160,6 +161,7 @@ class _Maker:
             "BODY_LISTEN": self._place.socket(robot.id),
             "BODY_DATA": self._data(f"{robot.id}-body"),
             "BODY_SECRET_FILE": str(self._place.keys(robot.id) / "body.secret"),
+            "BODY_FENCE": _json(fence_of(self._scenario.arena)),
         }
         name = f"{robot.id}-body"
         return self._process(name, "body", "robot_service.body", env, ("sim",), keys=robot.id, port=None)

@@ -100,11 +100,14 @@ TANK_INPUT = 1
 SHOULDER_X_M = 0.06
 SHOULDER_Z_M = 0.29
 """Pan axis and shoulder axis meet here, on the mast ahead of the axle."""
+MAST_RADIUS_M = 0.022
 UPPER_ARM_M = 0.24
 FOREARM_M = 0.22
 HAND_M = 0.13
 """Wrist axis to tool point: between the fingers, and where the nozzle lets go of the water."""
 GRIPPER_OPEN_M = 0.044
+GRIP_N_MAX = 9.0
+"""The fingers close no further at such a squeeze: half as much again as a good grip has, and within the sensor's range."""
 CAMERA_IN_HAND_M = (0.03, 0.0, 0.045)
 """Camera centre from the wrist axis along (hand x, y, z); it looks along hand x, its picture's top is hand z."""
 CAMERA_PIXELS = (640, 480)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from core.manipulation.arm import Joints
 from core.robots import gardener
@@ -22,7 +23,7 @@ class Actuators:
         self._base, self._servos = base, servos
         self._said = STOP
         self._said_s = -math.inf
-        self._arm_until_s = -math.inf
+        self._arm_until_s = self._gripper_until_s = -math.inf
         self._links = (-math.inf, -math.inf)
         self._pump_since_s: float | None = None
         self._pumped_s = 0.0
@@ -54,9 +55,15 @@ class Actuators:
             # A device that came back knows nothing of what it was told before.
             self._links = links
             self.halt(now_s)
+        if command.gripper_holds and now_s < self._gripper_until_s:
+            # The board stops all of its channels or none: what else was asked for is said again.
+            self._servos.stop()
+            self._count(False, now_s)
+            self._said, self._gripper_until_s = replace(self._said, arm=None, roll_rad=None), -math.inf
         self._switch_pump(command.pump, now_s)
         self._move_base(command, now_s)
         self._move_arm(command, now_s)
+        self._move_gripper(command, now_s)
         self._said = command
 
     def halt(self, now_s: float) -> None:
@@ -64,7 +71,7 @@ class Actuators:
         self._count(False, now_s)
         self._servos.stop()
         self._base.stop()
-        self._said, self._arm_until_s = STOP, -math.inf
+        self._said, self._arm_until_s, self._gripper_until_s = STOP, -math.inf, -math.inf
 
     def pump_off(self, now_s: float) -> None:
         """The independent off-timer's hand on the relay."""
@@ -98,12 +105,10 @@ class Actuators:
         moved = dict[int, float]()
         if command.arm is not None and command.arm != said.arm:
             moved |= _pulses(command.arm)
-        if command.gripper_m is not None and command.gripper_m != said.gripper_m:
-            moved |= _gripper_pulse(command.gripper_m)
         if command.roll_rad is not None and command.roll_rad != said.roll_rad:
             moved[gardener.ROLL_SERVO.channel] = gardener.ROLL_SERVO.pulse_us(command.roll_rad)
         if moved:
-            duration_s = command.arm_s if command.arm is not None else _GRIPPER_S
+            duration_s = command.arm_s if command.arm is not None else _ROLL_S
             self._servos.move(moved, duration_s)
             self._arm_until_s = max(self._arm_until_s, now_s + duration_s + SETTLE_S)
         elif command.arm is None and said.arm is not None and self.arm_moving(now_s):
@@ -112,9 +117,21 @@ class Actuators:
             if command.pump:
                 self._servos.output(gardener.PUMP_CHANNEL, True)
 
+    def _move_gripper(self, command: Command, now_s: float) -> None:
+        """A move of its own, no faster than its servo: pulses that ran ahead would squeeze before the force is felt."""
+        opening_m, was_m = command.gripper_m, self._said.gripper_m
+        if opening_m is None or opening_m == was_m:
+            return
+        share = 1.0 if was_m is None else abs(opening_m - was_m) / gardener.GRIPPER_OPEN_M
+        duration_s = max(_GRIPPER_S_MIN, share * (_GRIPPER.max_rad - _GRIPPER.min_rad) / _GRIPPER.speed_radps_max)
+        self._servos.move(_gripper_pulse(opening_m), duration_s)
+        self._gripper_until_s = now_s + duration_s + SETTLE_S
+        self._arm_until_s = max(self._arm_until_s, self._gripper_until_s)
+
 
 _GRIPPER = gardener.SERVOS["gripper"]
-_GRIPPER_S = 0.5
+_GRIPPER_S_MIN = 0.1
+_ROLL_S = 0.5
 
 
 def _pulses(q: Joints) -> dict[int, float]:
@@ -125,6 +142,12 @@ def _pulses(q: Joints) -> dict[int, float]:
 def _gripper_pulse(opening_m: float) -> dict[int, float]:
     share = opening_m / gardener.GRIPPER_OPEN_M
     return {_GRIPPER.channel: _GRIPPER.pulse_us(_GRIPPER.min_rad + share * (_GRIPPER.max_rad - _GRIPPER.min_rad))}
+
+
+def gripper_opening_m(pulses_us: dict[int, float]) -> float | None:
+    """The fingers' opening that the board commands now; None until it has driven them."""
+    pulse_us = pulses_us.get(_GRIPPER.channel)
+    return None if pulse_us is None else gardener.gripper_opening_m(_GRIPPER.angle_rad(pulse_us))
 
 
 def arm_angles(pulses_us: dict[int, float]) -> Joints | None:

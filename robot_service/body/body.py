@@ -65,7 +65,8 @@ class BodyNode:
         self._clock, self._drivers = clock, drivers
         self.ledger = Ledger(settings.data, settings.caps, clock, disk)
         self.latch = StopLatch(settings.data, clock, disk)
-        self.senses = Senses(drivers.base, drivers.servos, drivers.localizer)
+        wheelbase_m = gardener.WHEELBASE_M[settings.create]
+        self.senses = Senses(drivers.base, drivers.servos, drivers.localizer, settings.fence, wheelbase_m)
         self.actuators = Actuators(drivers.base, drivers.servos)
         self.doser = Doser(self.ledger, self.actuators, clock)
         self.brain = BrainPort(

@@ -10,14 +10,17 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from core.manipulation.arm import Joints, limit_broken, reach_m
+from core.manipulation.arm import Joints, limit_broken, reach_m, strikes
 from core.robots import gardener
+from core.robots.fence import Fence
 from core.wire.body import COMMAND_LIFE_S, Setpoint
 
 LIFE_S = COMMAND_LIFE_S - 0.06
 """Three control periods early, so that the wheels stand within the contract's life."""
 BASE_FRESH_S = 0.5
 SERVO_FRESH_S = 2.0
+PLACE_FRESH_S = 2.0
+"""A marker seen within this time, and the wheels since then, tell the place: the sensor speaks twice a second."""
 ACCEL_MPS2 = 1.0
 OMEGA_ACCEL_RADPS2 = 8.0
 SLOW_MPS, SLOW_RADPS = 0.10, 0.6
@@ -25,6 +28,10 @@ SLOW_MPS, SLOW_RADPS = 0.10, 0.6
 ARM_OUT_M = gardener.BODY_RADIUS_M + 0.05
 ARM_NEAR_RAD = 0.05
 ARM_S_MAX = 30.0
+FORCE_FRESH_S = 0.8
+"""The board is asked ten times a second while something moves, and twice while all stands."""
+GRIP_SLACK_M = 0.0005
+"""The board tells its pulses to 10 us, which is 0.45 mm of the fingers' opening."""
 TANK_EMPTY_ML = 5.0
 DOSE_END_ML = 0.05
 """This near to the dose the dose is done: a millisecond of pumping is no reason to switch a relay."""
@@ -42,6 +49,8 @@ class Command:
     """None stops the arm where it is."""
     arm_s: float = 0.0
     gripper_m: float | None = None
+    gripper_holds: bool = False
+    """The fingers stop where they are."""
     roll_rad: float | None = None
     pump: bool = False
 
@@ -81,8 +90,19 @@ class GateState:
     docked: bool = False
     arm_rad: Joints | None = None
     arm_moving: bool = False
+    gripper_m: float | None = None
+    """The opening that the board commands now; None while nobody knows it."""
+    force_n: float | None = None
+    """What the fingers squeeze with; None while the sensor is silent."""
+    force_s: float = -math.inf
+    """When that was read."""
     tank_ml: float | None = None
     dose: Dose = Dose()
+    fence: Fence | None = None
+    place: tuple[float, float, float] | None = None
+    """The base in the fence's frame [m, m, rad], by ceiling markers and wheels."""
+    place_s: float = -math.inf
+    """When a marker was seen last."""
     v_mps: float = 0.0
     omega_radps: float = 0.0
     """What the wheels were told last."""
@@ -110,12 +130,21 @@ def check(setpoint: Setpoint | None, state: GateState, now_s: float) -> Verdict:
     if why := _nothing_moves(setpoint, state, now_s):
         return Verdict(refusals=(why,) if wants_anything(setpoint) else ())
     refusals: list[str] = []
-    base, v, omega = _base(setpoint, state, refusals)
+    base, v, omega = _base(setpoint, state, now_s, refusals)
     arm, arm_s = _arm(setpoint, state, refusals)
-    gripper_m, roll_rad = _gripper(setpoint, refusals), _roll(setpoint, refusals)
+    gripper_m, roll_rad = _gripper(setpoint, state, now_s, refusals), _roll(setpoint, refusals)
     pump, debit_ml = _pump(setpoint, state, refusals)
-    hand = {"gripper_m": gripper_m, "roll_rad": roll_rad}
-    command = Command(base=base, v_mps=v, omega_radps=omega, arm=arm, arm_s=arm_s, **hand, pump=pump)
+    command = Command(
+        base=base,
+        v_mps=v,
+        omega_radps=omega,
+        arm=arm,
+        arm_s=arm_s,
+        gripper_m=gripper_m,
+        gripper_holds=gripper_m is None and setpoint.gripper_m is not None,
+        roll_rad=roll_rad,
+        pump=pump,
+    )
     return Verdict(command=command, refusals=tuple(refusals), debit_ml=debit_ml)
 
 
@@ -148,17 +177,29 @@ def _finite(setpoint: Setpoint) -> bool:
     return all(map(math.isfinite, numbers))
 
 
-def _base(setpoint: Setpoint, state: GateState, refusals: list[str]) -> tuple[Base, float, float]:
+def _base(setpoint: Setpoint, state: GateState, now_s: float, refusals: list[str]) -> tuple[Base, float, float]:
     if setpoint.base == "stop":
         return "stop", 0.0, 0.0
     v, omega = (0.0, 0.0) if setpoint.base == "seek_dock" else _limited(setpoint.v_mps, setpoint.omega_radps)
     if why := _base_refusal(setpoint, state, v, omega):
         refusals.append(why)
         return "stop", 0.0, 0.0
-    if setpoint.base == "seek_dock":
-        return "seek_dock", 0.0, 0.0
     dt_s = min(max(state.dt_s, 0.0), 0.1)
-    return "drive", _slew(state.v_mps, v, ACCEL_MPS2 * dt_s), _slew(state.omega_radps, omega, OMEGA_ACCEL_RADPS2 * dt_s)
+    v = _slew(state.v_mps, v, ACCEL_MPS2 * dt_s)
+    omega = _slew(state.omega_radps, omega, OMEGA_ACCEL_RADPS2 * dt_s)
+    if why := _fence_refusal(setpoint, state, now_s, v, omega):
+        refusals.append(why)
+        return "stop", 0.0, 0.0
+    return ("drive", v, omega) if setpoint.base == "drive" else ("seek_dock", 0.0, 0.0)
+
+
+def _fence_refusal(setpoint: Setpoint, state: GateState, now_s: float, v: float, omega: float) -> str:
+    """Nobody leaves the fence; who stands outside of it may only come back. Without a fresh place it judges nothing."""
+    if state.fence is None or state.place is None or not 0.0 <= now_s - state.place_s <= PLACE_FRESH_S:
+        return ""
+    if setpoint.base == "seek_dock":
+        return "outside the fence: drive back in first" if state.fence.outside_m(*state.place[:2]) > 0.0 else ""
+    return "the fence: only back in" if state.fence.leaves(state.place, v, omega) else ""
 
 
 def _base_refusal(setpoint: Setpoint, state: GateState, v: float, omega: float) -> str:
@@ -195,8 +236,10 @@ def _arm(setpoint: Setpoint, state: GateState, refusals: list[str]) -> tuple[Joi
     why = limit_broken(goal)
     if not why and not 0.0 <= setpoint.arm_s <= ARM_S_MAX:
         why = f"an arm move of {setpoint.arm_s:g} s is outside 0 .. {ARM_S_MAX:g} s"
-    if not why and state.arm_rad is None and _furthest(goal, gardener.ARM_HOME_RAD) > ARM_NEAR_RAD:
-        why = "the arm's place is unknown: the first move must go to the folded pose"
+    if not why and _furthest(goal, gardener.ARM_HOME_RAD) > ARM_NEAR_RAD:
+        # The folded pose is always allowed: it is the way out of anything.
+        unknown = "the arm's place is unknown: the first move must go to the folded pose"
+        why = unknown if state.arm_rad is None else strikes(state.arm_rad, goal)
     if why:
         refusals.append(why)
         return None, 0.0
@@ -210,12 +253,26 @@ def _furthest(a: Joints, b: Joints) -> float:
     return max(abs(x - y) for x, y in zip(a, b, strict=True))
 
 
-def _gripper(setpoint: Setpoint, refusals: list[str]) -> float | None:
-    opening_m = setpoint.gripper_m
-    if opening_m is None or 0.0 <= opening_m <= gardener.GRIPPER_OPEN_M:
-        return opening_m
-    refusals.append(f"a gripper opening of {opening_m:g} m is outside 0 .. {gardener.GRIPPER_OPEN_M:g} m")
-    return None
+def _gripper(setpoint: Setpoint, state: GateState, now_s: float, refusals: list[str]) -> float | None:
+    if setpoint.gripper_m is None:
+        return None
+    if why := _gripper_refusal(setpoint.gripper_m, state, now_s):
+        refusals.append(why)
+        return None
+    return setpoint.gripper_m
+
+
+def _gripper_refusal(opening_m: float, state: GateState, now_s: float) -> str:
+    """To open is always allowed, and so is to hold what is held."""
+    if not 0.0 <= opening_m <= gardener.GRIPPER_OPEN_M:
+        return f"a gripper opening of {opening_m:g} m is outside 0 .. {gardener.GRIPPER_OPEN_M:g} m"
+    if opening_m >= (gardener.GRIPPER_OPEN_M if state.gripper_m is None else state.gripper_m) - GRIP_SLACK_M:
+        return ""
+    if state.force_n is None or not 0.0 <= now_s - state.force_s <= FORCE_FRESH_S:
+        return "the force sensor is silent: the fingers may only open"
+    if not state.force_n < gardener.GRIP_N_MAX:
+        return f"the fingers squeeze with {state.force_n:.1f} N: they may only open"
+    return ""
 
 
 def _roll(setpoint: Setpoint, refusals: list[str]) -> float | None:

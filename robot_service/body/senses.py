@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from core.manipulation.arm import Joints
 from core.robots import gardener
+from core.robots.fence import Fence
 from core.wire.body import BodyState, Marker
 from hw.ports import Base, BaseReading, LinkStatus, Localizer, MarkerFix, ServoBoard, ServoReading
-from robot_service.body.actuators import arm_angles
+from robot_service.body.actuators import arm_angles, gripper_opening_m
 from robot_service.body.gate import Dose, GateState
+from robot_service.body.whereabouts import Whereabouts
 
 _NO_BASE = BaseReading(stamp_s=-1e9, left_m=0.0, right_m=0.0)
 _NO_SERVOS = ServoReading(stamp_s=-1e9)
@@ -52,11 +55,16 @@ class Sight:
 class Senses:
     """The three devices, read."""
 
-    def __init__(self, base: Base, servos: ServoBoard, localizer: Localizer) -> None:
+    def __init__(
+        self, base: Base, servos: ServoBoard, localizer: Localizer, fence: Fence | None = None, wheelbase_m: float = 0.235
+    ) -> None:
         self._base, self._servos, self._localizer = base, servos, localizer
         self._sight = Sight()
+        self._fence = fence
+        self._whereabouts = None if fence is None else Whereabouts(fence.markers, wheelbase_m)
         self._epoch = 0
         self._base_since_s: float | None = None
+        self._lifted = False
         self._arm_of: ServoReading | None = None
         self._arm: Joints | None = None
         self._told_of: Joints | None = None
@@ -75,6 +83,15 @@ class Senses:
         if link.up and link.since_s != self._base_since_s:
             self._base_since_s = link.since_s
             self._epoch += 1
+            self._lifted = True
+        if self._whereabouts is not None and self._base.reading is not None:
+            if self._lifted or self._wheel_drop():
+                self._whereabouts.forget()
+            self._lifted = False
+            self._whereabouts.look(self.base, self._localizer.fix)
+
+    def _wheel_drop(self) -> bool:
+        return self.base.drop_left or self.base.drop_right or self.base.drop_caster
 
     @property
     def arm_rad(self) -> Joints | None:
@@ -120,7 +137,7 @@ class Senses:
         omega_radps: float,
         dt_s: float,
     ) -> GateState:
-        b = self.base
+        b, where = self.base, self._whereabouts
         return GateState(
             heard_s=heard_s,
             stopped=stopped,
@@ -129,14 +146,20 @@ class Senses:
             base_s=b.stamp_s,
             servo_up=self._servos.link.up,
             servo_s=self.servos.stamp_s,
-            wheel_drop=b.drop_left or b.drop_right or b.drop_caster,
+            wheel_drop=self._wheel_drop(),
             cliff=b.cliff_left or b.cliff_front_left or b.cliff_front_right or b.cliff_right,
             bump=b.bump_left or b.bump_right,
             docked=b.mated,
             arm_rad=self.arm_rad,
             arm_moving=arm_moving or self.servos.moving,
+            gripper_m=gripper_opening_m(self.servos.pulses_us),
+            force_n=self.force_n(now_s),
+            force_s=self.servos.stamp_s,
             tank_ml=self.tank_ml(now_s),
             dose=dose,
+            fence=self._fence,
+            place=None if where is None else where.place,
+            place_s=-math.inf if where is None else where.seen_s,
             v_mps=v_mps,
             omega_radps=omega_radps,
             dt_s=dt_s,

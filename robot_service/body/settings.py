@@ -9,6 +9,7 @@ from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from core.errors import ConfigError
+from core.robots.fence import Fence
 from robot_service.body.caps import Caps
 
 SECRET_CHARS_MIN = 16
@@ -32,6 +33,8 @@ class BodySettings(BaseSettings):
     secret_file: Path | None = None
     secret: str = ""
     caps: Caps = Caps()
+    fence: Fence | None = None
+    """Where the wheels may take it, as far as ceiling markers tell."""
 
     def shared_secret(self) -> str:
         """What a brain must say first; raises ConfigError when there is none worth the name."""

@@ -29,6 +29,7 @@ from core.manipulation.approach import (
 )
 from core.manipulation.arm import Point3
 from core.manipulation.servo import Target
+from core.robots.gardener import GRIP_N_MAX
 from core.wire.fruit import Fruit, Pick
 from core.wire.market import Permit, PlantCard
 from robot_service.eye import Look
@@ -62,7 +63,6 @@ DOCKING_SIGMA_M = 0.006
 PLACES_MAX = 2
 """The dock, and once a little beside it."""
 SHIFT_MPS, SHIFT_RADPS, SHIFT_S, SHIFT_SHARE = 0.08, 0.15, 2.0, 0.7
-GRIP_N_MAX = 9.0
 FIRM_N, FURTHER_M = 5.75, 0.010
 """What lies between the pads is squeezed with the gripper's 6 N. Less is felt where only their tips hold it, and it would
 slip out of them: so much further in they hold it."""

@@ -35,6 +35,7 @@ class FakeBase:
         self.doing: tuple[Any, ...] = ("stop",)
         self.log: list[tuple[float, tuple[Any, ...]]] = []
         self.resting = False
+        self.left_m = self.right_m = 0.0
 
     def _do(self, *what: Any) -> None:
         self.doing = what
@@ -55,8 +56,18 @@ class FakeBase:
     async def run(self) -> None:
         while True:
             if self.link.up:
-                self.reading = BaseReading(stamp_s=self._clock.now(), left_m=0.0, right_m=0.0, **self.sense)
+                travel = {"left_m": self.left_m, "right_m": self.right_m}
+                self.reading = BaseReading(stamp_s=self._clock.now(), **travel, **self.sense)
+            began_s = self._clock.now()
             await self._clock.sleep(1.0 if self.resting else 0.015)
+            self._roll(self._clock.now() - began_s)
+
+    def _roll(self, dt_s: float) -> None:
+        if self.doing[0] == "drive":
+            _, v_mps, omega_radps = self.doing
+            half_m = omega_radps * gardener.WHEELBASE_M["create2"] / 2
+            self.left_m += (v_mps - half_m) * dt_s
+            self.right_m += (v_mps + half_m) * dt_s
 
 
 class FakeServos:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import math
 import sys
@@ -12,10 +13,14 @@ from typing import Any
 import pytest
 
 from core.errors import ConfigError, StorageError
+from core.geometry.planar import Pose, compose, invert
 from core.robots import gardener
+from core.robots.fence import KEEP_M, Fence
 from core.virtual import run_virtual
 from core.wire.body import Setpoint
-from hw.ports import MarkerFix
+from core.wire.geometry import Pose2
+from hw.ports import BaseReading, MarkerFix
+from robot_service.body.whereabouts import Whereabouts
 
 _spec = importlib.util.spec_from_file_location("body_stand_ins", Path(__file__).with_name("stand_ins.py"))
 assert _spec is not None
@@ -371,6 +376,79 @@ def test_the_arm_must_be_folded_first_when_nobody_knows_where_it_is(tmp_path: Pa
         await rig.until(lambda: len(rig.servos.moves) == 2)
 
     story(tmp_path, tell, folded=False)
+
+
+FENCE = Fence(x_m_min=-1.0, x_m_max=1.0, y_m_min=-1.0, y_m_max=1.0, markers={400: Pose2(x_m=0.5, y_m=0.0, yaw_rad=1.0)})
+MARKER = (0.5, 0.0, 1.0)
+
+
+async def watched(rig: Any, start: Pose, far: list[Pose]) -> None:
+    """The truth from the wheels, and a marker's fix of it twice a second, told 0.06 s later; every seventh jumps."""
+    wheelbase_m, was, pose, count = gardener.WHEELBASE_M["create2"], (0.0, 0.0), start, 0
+    while True:
+        count += 1
+        fix = invert(compose(invert(pose), MARKER))
+        jump_m = 0.6 if count % 7 == 0 else 0.0
+        seen_s = rig.clock.now()
+        for step in range(10):
+            await rig.clock.sleep(0.05)
+            left_m, right_m = rig.base.left_m, rig.base.right_m
+            ahead_m, turn_rad = (left_m + right_m - sum(was)) / 2, (right_m - left_m - was[1] + was[0]) / wheelbase_m
+            was = left_m, right_m
+            pose = compose(pose, (ahead_m, 0.0, turn_rad))
+            far.append(pose)
+            if step == 1:
+                x_m, y_m, yaw_rad = fix
+                rig.localizer.fix = MarkerFix(stamp_s=seen_s, marker_id=400, x_m=x_m + jump_m, y_m=y_m, yaw_rad=yaw_rad)
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.7, -2.5])
+def test_a_brain_that_drives_on_for_ever_is_stopped_at_the_fence_and_may_come_back(tmp_path: Path, yaw_rad: float) -> None:
+    async def tell(rig: Any) -> None:
+        far: list[Pose] = []
+        rig.tasks.append(asyncio.create_task(watched(rig, (0.0, 0.0, yaw_rad), far)))
+        brain = await rig.brain()
+        rig.servos.tank_v = 3.0
+        await rig.clock.sleep(1.0)
+        brain.wish = Setpoint(seq=0, base="drive", v_mps=0.5)
+        await rig.clock.sleep(20.0)
+        furthest = max(max(abs(x), abs(y)) for x, y, _ in far)
+        assert 0.8 < furthest < 1.0 - KEEP_M + 0.05
+        assert "fence" in brain.state.refusal
+        brain.wish = Setpoint(seq=0, base="drive", v_mps=-0.3)
+        await rig.clock.sleep(2.0)
+        assert max(abs(far[-1][0]), abs(far[-1][1])) < furthest - 0.3
+        assert brain.state.refusal == ""
+
+    story(tmp_path, tell, fence=FENCE)
+
+
+def test_without_markers_or_without_a_fence_the_body_judges_no_place(tmp_path: Path) -> None:
+    async def tell(rig: Any) -> None:
+        brain = await rig.brain()
+        brain.wish = Setpoint(seq=0, base="drive", v_mps=0.5)
+        await rig.clock.sleep(6.0)
+        assert rig.base.left_m > 2.0
+
+    story(tmp_path, tell, fence=FENCE)
+    story(tmp_path, tell)
+
+
+def test_a_lifted_robot_or_a_new_link_knows_its_place_only_by_a_marker() -> None:
+    where = Whereabouts(FENCE.markers, 0.235)
+    for n in range(20):
+        where.look(BaseReading(stamp_s=n * 0.02, left_m=0.01 * n, right_m=0.01 * n), None)
+    assert where.place is None
+    seen = MarkerFix(stamp_s=0.2, marker_id=400)
+    where.look(BaseReading(stamp_s=0.4, left_m=0.2, right_m=0.2), seen)
+    assert where.place == pytest.approx((0.5 + 0.1 * math.cos(1.0), 0.1 * math.sin(1.0), 1.0))
+    assert where.seen_s == 0.2
+    unknown = MarkerFix(stamp_s=0.41, marker_id=999)
+    where.look(BaseReading(stamp_s=0.42, left_m=0.3, right_m=0.3), unknown)
+    assert where.place == pytest.approx((0.5 + 0.2 * math.cos(1.0), 0.2 * math.sin(1.0), 1.0))
+    where.forget()
+    where.look(BaseReading(stamp_s=0.44, left_m=0.0, right_m=0.0), unknown)
+    assert where.place is None
 
 
 def test_no_secret_no_body(tmp_path: Path) -> None:

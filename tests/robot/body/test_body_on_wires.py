@@ -133,6 +133,40 @@ def test_within_0_3_s_of_the_brains_last_word_all_is_still(tmp_path: Path, wish:
     story(tmp_path, pose, tell)
 
 
+def test_fingers_stop_where_they_squeeze_too_hard_and_open_all_the_same(tmp_path: Path) -> None:
+    gripper = gardener.SERVOS["gripper"]
+
+    async def tell(wired: Wired) -> None:
+        def opening_m() -> float:
+            return gardener.gripper_opening_m(gripper.angle_rad(wired.rig.pulses_us[gripper.channel]))
+
+        brain = await wired.brain()
+        wired.rig.volts[gardener.FORCE_INPUT] = 0.0
+        brain.wish = Setpoint(seq=0, arm=HOME, gripper_m=0.04)
+        await wired.until(lambda: gripper.channel in wired.rig.pulses_us and opening_m() > 0.039)
+        await wired.clock.sleep(1.0)
+        brain.wish = Setpoint(seq=0, arm=HOME, gripper_m=0.0)
+        await wired.until(lambda: opening_m() < 0.03)
+        wired.rig.volts[gardener.FORCE_INPUT] = gardener.FORCE_SENSOR_V_MAX
+        began_m = opening_m()
+        await wired.clock.sleep(0.3)
+        held_m = opening_m()
+        assert 0.005 < held_m < began_m
+        await wired.clock.sleep(2.0)
+        assert opening_m() == held_m
+        assert "they may only open" in brain.state.refusal
+        brain.wish = Setpoint(seq=0, arm=HOME, gripper_m=0.04)
+        await wired.until(lambda: opening_m() > 0.039)
+        wired.rig.volts[gardener.FORCE_INPUT] = 2.0
+        brain.wish = Setpoint(seq=0, arm=HOME, gripper_m=0.0)
+        await wired.until(lambda: opening_m() < 0.001)
+        wired.rig.volts[gardener.FORCE_INPUT] = gardener.FORCE_SENSOR_V_MAX
+        await wired.clock.sleep(1.0)
+        assert (opening_m(), brain.state.refusal) == (pytest.approx(0.0, abs=1e-3), "")
+
+    story(tmp_path, Pose(-1.4), tell)
+
+
 def test_the_base_docks_by_itself_and_charges(tmp_path: Path) -> None:
     async def tell(wired: Wired) -> None:
         brain = await wired.brain()
