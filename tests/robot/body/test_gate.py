@@ -572,16 +572,78 @@ def imported(path: Path) -> set[str]:
     return names | {n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)}
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "robot_service").rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))
+def names_of(path: Path, package: str) -> set[str]:
+    """What it imports of a package, `MODULE.NAME`; the module alone where it is imported whole."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    whole = {alias.name for n in nodes if isinstance(n, ast.Import) for alias in n.names}
+    parts = {f"{n.module}.{alias.name}" for n in nodes if isinstance(n, ast.ImportFrom) for alias in n.names}
+    return {name for name in whole | parts if name.split(".")[0] == package}
+
+
+def sources(folder: str) -> list[Path]:
+    return sorted((ROOT / folder).rglob("*.py"))
+
+
+BODY = ROOT / "robot_service" / "body"
+OF_HW = {
+    "__main__.py": {"hw.links.open_link"},
+    "bodylink.py": {"hw.links.ByteLink", "hw.links.Opener"},
+    "brain.py": {"hw.drivers.camera.open_camera", "hw.links.Opener"},
+}
+"""All that a brain has of devices: the stream to its body, and the camera, which moves nothing."""
+WIRES = {"socket", "serial", "serial_asyncio_fast", "pty", "os.open", "importlib"}
+WIRE_CALLS = {"open_connection", "open_unix_connection", "create_connection", "create_unix_connection", "open_link"}
+
+
+@pytest.mark.parametrize("path", sources("robot_service"), ids=lambda p: str(p.relative_to(ROOT)))
 def test_only_the_actuators_tell_a_device_to_move(path: Path) -> None:
-    inside = path.is_relative_to(ROOT / "robot_service" / "body")
-    if path.name == "body.py" and inside:
+    if path == BODY / "body.py":
         assert calls(path) & MOVING <= {"halt"}
-        return
-    # A camera moves nothing: the brain may look by itself.
-    assert not any(name.startswith("hw.drivers") for name in imported(path) - {"hw.drivers.camera"})
-    if inside and path.name != "actuators.py":
+    elif path.is_relative_to(BODY) and path.name != "actuators.py":
         assert not calls(path) & MOVING
+        assert not any(name.startswith("hw.drivers") for name in imported(path))
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in sources("robot_service") if not p.is_relative_to(BODY)], ids=lambda p: str(p.relative_to(ROOT))
+)
+def test_a_brain_has_no_drivers_protocols_or_links_but_the_stream_to_its_body_and_the_camera(path: Path) -> None:
+    mine = OF_HW.get(path.name, set()) if path.parent == BODY.parent else set()
+    assert names_of(path, "hw") <= mine
+    assert not any(name == wire or name.startswith(f"{wire}.") for name in imported(path) for wire in WIRES)
+    assert not calls(path) & WIRE_CALLS
+    assert not any(f"{name}.".startswith("robot_service.body.") for name in imported(path))
+
+
+def test_the_brain_opens_one_link_and_that_is_its_bodys() -> None:
+    opened = {p.name for p in sources("robot_service") if "_opener" in calls(p) or "opener" in called_names(p)}
+    assert opened == {"bodylink.py"}
+    assert "self._opener(self._url)" in (BODY.parent / "bodylink.py").read_text()
+
+
+def called_names(path: Path) -> set[str]:
+    """Of plain functions."""
+    tree = ast.parse(path.read_text())
+    return {n.func.id for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}
+
+
+def test_the_taps_valve_is_opened_at_one_place_after_its_debit() -> None:
+    """`Station.tap`: what may flow is written down before."""
+    opening = [
+        (path.relative_to(ROOT).as_posix(), function.name)
+        for folder in ("plant_service", "robot_service", "core", "console")
+        for path in sources(folder)
+        for function in ast.walk(ast.parse(path.read_text()))
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+        and any(isinstance(n, ast.Attribute) and n.attr == "open_for" for n in ast.walk(function))
+    ]
+    assert opening == [("plant_service/station.py", "tap")]
+    text = (ROOT / "plant_service" / "station.py").read_text()
+    assert text.count("open_for") == 1
+    assert text.index("meter.debit(") < text.index("open_for(")
+    makers = {p.name for p in sources("plant_service") if any(n.endswith("open_valve") for n in names_of(p, "hw"))}
+    assert makers == {"node.py"}
+    assert not [p for p in sources("plant_service") if any(n.startswith("hw.drivers.firmata") for n in imported(p))]
 
 
 def test_the_gate_is_small_and_pure() -> None:
