@@ -35,7 +35,7 @@ from hw.links import Opener
 from robot_service.bodylink import BodyLink
 from robot_service.docks import Docks
 from robot_service.eye import Eye
-from robot_service.fitness import PUMP, Fitness
+from robot_service.fitness import PUMP, Fitness, LeakWatch
 from robot_service.ground import Ground
 from robot_service.localisation import Localisation
 from robot_service.neighbours import Neighbours
@@ -86,7 +86,7 @@ class Brain:
         self._stopped = True
         self._travels: dict[tuple[int, str, str], float | None] = {}
         self._job_number = 0
-        self.body.listeners += [where.take, self.robot.watch, self._see]
+        self.body.listeners += [where.take, self.robot.watch, self._see, LeakWatch(self._leaks).see]
 
     # ------------------------------------------------------------------ readings
     def _idle(self) -> bool:
@@ -101,6 +101,10 @@ class Brain:
                 self.scheduler.halt(f"stopped by {state.stopped_by or 'the e-stop'}")
             else:
                 self.robot.fitness.looked_after()
+
+    def _leaks(self, how: str) -> None:
+        self.robot.note("alarm", how)
+        self.scheduler.cannot(PUMP, how)
 
     def missing(self) -> list[str]:
         """What keeps it from work, for `/readyz`."""

@@ -93,6 +93,11 @@ class Scheduler:
             self.robot.note("kill", f"{entry.kind} given back: {why}", task_id=entry.task_id)
             self.reporter.finish(entry, _gave_up(self.robot.settings.id, entry, why))
 
+    def cannot(self, part: str, why: str) -> None:
+        """Something was found broken beside the work: what waits for it is given back."""
+        self.robot.fitness.failed(part, why)
+        self._give_back_undoable()
+
     def _give_back_undoable(self) -> None:
         """What waits and asks for a pump that failed, or for water that is nowhere to be had."""
         robot, state = self.robot, self.robot.body.state

@@ -152,9 +152,14 @@ class Market(TaskBook):
         return self._finish(task, "cancelled", f"cancelled by {by}: {why}" if why else f"cancelled by {by}", now_s)
 
     def soil(self, ratio: float | None, why: str, now_s: float) -> None:
-        """A judged reading: the water content, or None and why. Settles an open permit when its time has come."""
+        """A judged reading: the water content, or None and why. Settles an open permit when its time has come.
+
+        Tells of water that no dose explains.
+        """
         if (measured := self._water.measured(ratio, why, now_s)) is not None:
             self._settle_dose(measured, now_s)
+        if told := self._water.unasked(now_s):
+            self._effects.append(Note("unasked", told, "", ""))
 
     def fruits(self, fruits: Iterable[Fruit], now_s: float) -> None:
         """The inventory as it is now; a harvest that nobody has begun ends when none of its fruit is left to pick."""

@@ -12,6 +12,9 @@ from core.allocation.plant_state import Limits, Soil
 from core.errors import Refused
 from core.wire.market import Permit
 
+UNASKED_RISE = 0.03
+"""A rise that is no noise and no change of the soil's own: 90 ml in three litres."""
+
 
 @dataclass(frozen=True, slots=True)
 class Measured:
@@ -33,6 +36,28 @@ class Measured:
         return self.rise >= permits.rise_needed(self.held.permit.dose_ml)
 
 
+@dataclass(slots=True)
+class _Watch:
+    """Looks for water that nobody had a permit for: while no dose is on its way, soil only dries."""
+
+    since_s: float
+    """Until then a dose may still soak in."""
+    lowest: float = math.inf
+
+    def see(self, ratio: float, now_s: float) -> str:
+        """What rose without a dose, once; empty when nothing did."""
+        if now_s < self.since_s:
+            return ""
+        before, self.lowest = self.lowest, min(self.lowest, ratio)
+        if ratio - self.lowest < UNASKED_RISE:
+            return ""
+        self.lowest = ratio
+        return f"soil went from {before:.3f} to {ratio:.3f} without a dose: a leak, or somebody watered by hand"
+
+    def rest(self, until_s: float) -> None:
+        self.since_s, self.lowest = until_s, math.inf
+
+
 class Watering:
     """The soil as last measured, the day's doses, and the permit that is not settled yet; `at_s` is when that was."""
 
@@ -51,6 +76,7 @@ class Watering:
         # The clock of before may not be this one: an open permit waits its whole time anew.
         self.open = None if open_permit is None else open_permit.model_copy(update={"issued_s": now_s})
         self.settle_at_s = math.inf
+        self._watch = _Watch(math.inf if self.open is not None else now_s + limits.soak_s)
 
     def given_ml(self, now_s: float) -> float:
         return permits.given_ml(self.doses, now_s)
@@ -74,6 +100,7 @@ class Watering:
         before = self.soil.ratio if self.soil.ratio is not None else 0.0
         self.open = OpenPermit(permit=permit, robot_id=robot_id, key=key, issued_s=now_s, before_ratio=before)
         self.settle_at_s, self.at_s = math.inf, now_s
+        self._watch.rest(math.inf)
         dose = Dose(permit_id=permit.permit_id, t_s=self.open.act_over_s(), ml=permit.dose_ml)
         self.doses = [*permits.recent(self.doses, now_s), dose]
 
@@ -106,6 +133,10 @@ class Watering:
         elif self.open is not None and not task_open:
             self.settle_at_s = self.open.act_over_s() + self.limits.soak_s
 
+    def unasked(self, now_s: float) -> str:
+        """What the newest reading tells of water that no dose explains, once; empty when nothing."""
+        return "" if self.soil.ratio is None else self._watch.see(self.soil.ratio, now_s)
+
     def measured(self, ratio: float | None, why: str, now_s: float) -> Measured | None:
         """A judged reading; settles the open permit when its time has come."""
         self.soil, self.at_s = Soil(ratio, why, now_s), now_s
@@ -113,6 +144,7 @@ class Watering:
             return None
         settled = Measured(self.open, ratio)
         self.open, self.settle_at_s = None, math.inf
+        self._watch.rest(now_s + self.limits.soak_s)
         return settled
 
     def waiting(self, now_s: float) -> str:

@@ -32,6 +32,9 @@ ARRIVE_S = 0.1
 LEVEL_ERROR_ML = 20.0
 """Two readings of the tank's level differ by this much at most without any water having gone."""
 
+PUMP_TOLERANCE = 1.1
+"""What comes out beyond what the running time says, at most."""
+
 TakePermit = Callable[[], Awaitable[tuple[Permit, float]]]
 """Asks the plant; returns the permit and when it was asked for [garden s]."""
 
@@ -90,10 +93,12 @@ async def _nozzle_over_soil(robot: Robot, plant: PlantCard, known: Sequence[Frui
 
 def _believe(poured: Poured, before_ml: float | None, after_ml: float | None) -> None:
     """The pump's running time says what came out; the tank's level must agree that it came."""
-    if before_ml is None or after_ml is None or poured.delivered_ml <= 2 * LEVEL_ERROR_ML:
+    if before_ml is None or after_ml is None:
         return
     gone_ml = max(0.0, before_ml - after_ml)
-    if gone_ml < poured.delivered_ml / 2:
+    too_little = poured.delivered_ml > 2 * LEVEL_ERROR_ML and gone_ml < poured.delivered_ml / 2
+    too_much = gone_ml > PUMP_TOLERANCE * poured.delivered_ml + 2 * LEVEL_ERROR_ML
+    if too_little or too_much:
         said_ml, poured.delivered_ml = poured.delivered_ml, gone_ml
         poured.why = f"the pump ran for {said_ml:.0f} ml, but the tank's level fell by {gone_ml:.0f} ml"
         poured.pump_failed = True

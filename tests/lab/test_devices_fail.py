@@ -99,6 +99,16 @@ def test_a_pump_that_does_not_start_fails_with_the_reason_and_the_pot_asks_again
     story.tell(story.one_pot(), told)
 
 
+def test_a_pump_that_does_not_stop_is_told_by_the_tank_and_no_other_dose_is_promised():
+    async def told(garden):
+        story.fault(garden, "pump_stuck", "robot-1", strength=1.0)
+        await story.said(garden, "robot-1", "the tank lost", within_s=120.0)
+        entries = await garden.get("robot-1", "/history")
+        assert any(entry["kind"] == "alarm" and "while the pump was off" in entry["what"] for entry in entries)
+
+    story.tell(story.one_pot(), told)
+
+
 @pytest.mark.parametrize(("kind", "doses"), [("soil_stuck", 3), ("soil_open", 0), ("soil_short", 0)])
 def test_a_pot_whose_probe_lies_stops_asking_and_says_why(kind, doses):
     """A stuck probe is known by sixty readings that do not differ; until then no more than three doses are tried."""

@@ -15,7 +15,7 @@ from core.allocation.auction import Round, better_than_holder, cheapest, no_bid,
 from core.allocation.epochs import Names, owner_of
 from core.allocation.permits import DAY_S, Dose, OpenPermit, given_ml, revived, rise_needed
 from core.allocation.plant_side import Market
-from core.allocation.plant_state import Grant, Keyed, Kill, Limits, MarketDocument, Solicit
+from core.allocation.plant_state import Grant, Keyed, Kill, Limits, MarketDocument, Note, Solicit
 from core.allocation.watering import Measured
 from core.errors import Conflict, NotFound, Refused, Unprocessable
 from core.wire.geometry import Point3, Pose2
@@ -53,6 +53,52 @@ def report(made: Market, task_id: str, state: Any, now_s: float, epoch: int = 1,
 
 def request(epoch: int = 1, robot_id: str = "robot-1") -> PermitRequest:
     return PermitRequest(robot_id=robot_id, epoch=epoch, act="water", amount_ml=150.0)
+
+
+def unasked(made: Market) -> list[str]:
+    return [e.what for e in made.take_effects() if isinstance(e, Note) and e.kind == "unasked"]
+
+
+def test_water_that_nobody_had_a_permit_for_is_told_of_once() -> None:
+    made = market()
+    for t_s, ratio in ((20.0, 0.150), (30.0, 0.149), (40.0, 0.178)):
+        made.soil(ratio, "", t_s)
+        assert not unasked(made), t_s
+    made.soil(0.180, "", 50.0)
+    assert unasked(made) == ["soil went from 0.149 to 0.180 without a dose: a leak, or somebody watered by hand"]
+    made.soil(0.182, "", 60.0)
+    assert not unasked(made)
+    made.soil(0.212, "", 70.0)
+    assert len(unasked(made)) == 1, "it goes on"
+
+
+def test_a_dose_and_what_of_it_soaks_in_later_is_not_taken_for_a_leak() -> None:
+    made = market()
+    made.soil(0.150, "", 20.0)
+    task_id = awarded(made, 20.0)
+    made.award_answered(task_id, 1, "", 20.0)
+    valid_s = made.permit(task_id, request(), "k", 21.0).valid_for_s
+    made.soil(0.190, "", 40.0)
+    report(made, task_id, "done", 50.0, delivered_ml=150.0)
+    over_s = 21.0 + valid_s + 50.0
+    for t_s, ratio in ((55.0, 0.195), (over_s, 0.200), (over_s + 9.0, 0.240)):
+        made.soil(ratio, "", t_s)
+    assert not unasked(made)
+    made.soil(0.240, "", over_s + 11.0)
+    made.soil(0.275, "", over_s + 12.0)
+    assert len(unasked(made)) == 1
+
+
+def test_after_a_restart_only_what_rises_from_then_on_is_told() -> None:
+    made = market()
+    made.soil(0.150, "", 20.0)
+    again = Market(CARD, made.document(), 30.0, limits=Limits(soak_s=10.0))
+    for t_s, ratio in ((31.0, 0.150), (39.0, 0.200), (41.0, 0.200), (42.0, 0.229)):
+        again.soil(ratio, "", t_s)
+    assert not unasked(again)
+    again.soil(None, "silent", 43.0)
+    again.soil(0.231, "", 44.0)
+    assert len(unasked(again)) == 1
 
 
 def test_the_cheapest_bid_wins_and_ties_go_by_id() -> None:

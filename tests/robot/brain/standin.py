@@ -95,7 +95,8 @@ class StandInBody:
         self.rng = random.Random(seed)
         self.markers = {n: (p.x_m, p.y_m, p.yaw_rad) for n, p in ceiling_markers(plane.garden.arena).items()}
         self.travel_scale, self.noise_m = 1.03, 0.006
-        self.battery_ratio, self.tank_ml = 0.9, 1200.0
+        self.battery_ratio = 0.9
+        self.tank_ml: float | None = 1200.0
         self.stopped, self.stopped_by, self.blind, self.pump_stuck = False, "", False, False
         self.disk_broken, self.stop_number = False, 0
         self.attracted_to = ""
@@ -510,6 +511,14 @@ class Garden:
     def award_of(self, plant: str, number: int = 1, epoch: int = 1, dose_ml: float = 150.0) -> Award:
         asked = self.plants[plant].announcement(number, dose_ml)
         return Award(announcement=asked, epoch=epoch, lease_s=8.0, cost_s=60.0)
+
+    async def empty_tank(self, robot: str, left_ml: float) -> None:
+        """Somebody takes the tank off, pours it out and puts it back."""
+        body = self.bodies[robot]
+        body.tank_ml = None
+        await self.clock.sleep(2.5)  # a resting body says something every two seconds
+        body.tank_ml = left_ml
+        await self.clock.sleep(2.5)
 
     async def bid(self, plant: str, robot: str = "robot-1", dose_ml: float = 150.0) -> Bid:
         answer = await self.call(robot, "POST", "/bids", self.plants[plant].announcement(99, dose_ml), as_=plant)

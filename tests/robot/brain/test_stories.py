@@ -287,8 +287,7 @@ def test_a_neighbouring_pot_that_attracts_the_docking_robot_is_noticed():
 def test_a_robot_with_too_little_water_prices_and_does_the_refill_first():
     async def story(garden):
         full = await garden.bid("plant-1")
-        garden.bodies["robot-1"].tank_ml = 60.0
-        await garden.clock.sleep(1.0)
+        await garden.empty_tank("robot-1", 60.0)
         bid = await garden.bid("plant-1")
         assert bid.breakdown.refill_s > 30.0
         assert bid.cost_s > full.cost_s + 30.0
@@ -439,12 +438,32 @@ def test_whoever_releases_a_robot_has_looked_at_its_pump():
     in_garden(story)
 
 
+def test_a_tank_that_empties_with_the_pump_off_raises_an_alarm_and_gives_waterings_back():
+    async def story(garden):
+        brain, body = garden.brains["robot-1"], garden.bodies["robot-1"]
+        await garden.award("plant-3")
+        await garden.until(lambda: body.v > 0.2, 20.0)
+        await garden.award("plant-2", number=2)
+        for _ in range(100):
+            body.tank_ml -= 1.0
+            await garden.clock.sleep(0.1)
+            given_back = [plant.ended for plant in garden.plants.values() if plant.ended]
+            if given_back:
+                break
+        assert given_back[0].reason.startswith("the tank lost"), given_back
+        alarms = [entry.what for entry in brain.events.since(0) if entry.kind == "alarm"]
+        assert len(alarms) == 1
+        assert alarms[0].endswith("ml while the pump was off")
+        assert "the tank lost" in (await garden.bid("plant-1")).reason
+
+    in_garden(story)
+
+
 def test_at_a_dry_tap_what_there_is_water_for_stays_and_the_rest_is_given_back_with_the_reason():
     async def story(garden):
         brain = garden.brains["robot-1"]
         garden.station.dry = True
-        garden.bodies["robot-1"].tank_ml = 60.0
-        await garden.clock.sleep(1.0)
+        await garden.empty_tank("robot-1", 60.0)
         await garden.award("plant-1", number=1)
         await garden.award("plant-2", number=2)
         gone = [garden.plants[name] for name in ("plant-1", "plant-2")]
