@@ -17,7 +17,7 @@ $(STAMP): pyproject.toml uv.lock
 	  || { echo "Python 3.11 to 3.13 is needed; name one: make PYTHON=python3.12"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@test -x $(BIN)/uv || $(BIN)/python -m pip install --quiet "uv>=0.9,<1"
-	$(BIN)/uv sync --frozen --compile-bytecode --extra dev --extra conformance --extra bench --extra discovery --extra record
+	$(BIN)/uv sync --frozen --compile-bytecode --extra dev --extra conformance --extra bench --extra cluster --extra discovery --extra record
 	$(BIN)/python -m console.warm
 	@touch $@
 

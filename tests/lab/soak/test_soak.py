@@ -13,6 +13,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from core.errors import ConfigError
 from lab.soak.cli import soak_all, soak_command
 from lab.soak.run import Plan, as_json, soak
 
@@ -63,6 +64,39 @@ def test_a_broken_invariant_comes_with_a_line_that_breaks_it_again():
         assert again.exit_code == 1
         assert json.loads(again.stdout) == document
         assert line in first.stderr
+
+
+ON_A_CLUSTER = """
+from distributed import LocalCluster
+from core.errors import ConfigError
+from lab.soak.cli import soak_all
+from lab.soak.run import Plan
+
+if __name__ == "__main__":
+    with LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
+        plans = [Plan(seed=seed, days=0.01, hurry=2.0) for seed in (3, 4)]
+        told = []
+        outcomes = soak_all(plans, 0, told.append, cluster.scheduler_address)
+        assert sorted(each.seed for each in told) == [3, 4]
+        print([(each.seed, each.trace) for each in outcomes])
+"""
+
+
+def test_a_cluster_lives_through_the_same_gardens(tmp_path):
+    (tmp_path / "on_a_cluster.py").write_text(ON_A_CLUSTER)
+    root = str(Path(__file__).resolve().parents[3])
+    command = [sys.executable, "-W", "ignore", str(tmp_path / "on_a_cluster.py")]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": root}, capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stderr[-3000:]
+    here = [(seed, soak(Plan(seed=seed, days=0.01, hurry=2.0)).trace) for seed in (3, 4)]
+    assert done.stdout.splitlines()[-1] == str(here)
+
+
+def test_a_cluster_that_is_not_there_is_named(monkeypatch):
+    monkeypatch.setattr("lab.soak.cli.CLUSTER_WITHIN_S", 0.5)
+    with pytest.raises(ConfigError, match=r"tcp://127\.0\.0\.1:9") as error:
+        soak_all([Plan(seed=1, days=0.01)], 1, print, "tcp://127.0.0.1:9")
+    assert "dask scheduler" in error.value.hint
 
 
 def _soaked(*words):
