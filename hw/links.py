@@ -9,6 +9,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import os
 from asyncio import get_running_loop
 from collections import deque
 from collections.abc import Awaitable, Callable
@@ -68,6 +70,13 @@ class StreamLink:
         if self._writer.transport.get_write_buffer_size() > WRITE_BUFFER_BYTES_MAX:
             raise LinkDown(f"{self._name} does not take bytes any more")
         self._writer.write(data)
+
+    def write_past_the_loop(self, data: bytes) -> None:
+        """What of it the wire takes at once, although the loop hangs: for a device's last words. Never raises."""
+        transport = self._writer.transport
+        port = transport.get_extra_info("socket") or transport.get_extra_info("serial")
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            os.write(port.fileno(), data)
 
     async def close(self) -> None:
         self._writer.close()

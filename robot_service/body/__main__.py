@@ -16,6 +16,7 @@ from core.mesh.runtime import GardenSettings, make_clock, setup_logging
 from hw.links import open_link
 from robot_service.body.body import build_body
 from robot_service.body.settings import BodySettings
+from robot_service.body.watchdog import Watchdog, Wires, last_words
 
 _log = structlog.get_logger("robot.body")
 
@@ -26,7 +27,10 @@ async def _serve(garden: GardenSettings, settings: BodySettings) -> None:
     async with asyncio.TaskGroup() as group:
         clocks = [group.create_task(_run(loop())) for loop in clock_loops]
         await _first_time(clock)
-        body = group.create_task(build_body(settings, clock, open_link).run())
+        wires = Wires(open_link)
+        node = build_body(settings, clock, wires.open)
+        clocks.append(group.create_task(Watchdog(node, wires, last_words(settings)).run()))
+        body = group.create_task(node.run())
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, body.cancel)
         await asyncio.wait([body])

@@ -25,7 +25,7 @@ from hw.ports import Base, Localizer, ServoBoard
 from hw.protocols.create import Mode, Model
 from robot_service.body.actuators import Actuators
 from robot_service.body.caps import Ledger, StopLatch
-from robot_service.body.gate import GateState, Verdict, check
+from robot_service.body.gate import STOP, GateState, Verdict, check
 from robot_service.body.pump import Doser
 from robot_service.body.senses import Senses
 from robot_service.body.settings import BodySettings
@@ -140,6 +140,15 @@ class BodyNode:
         self._rest_or_wake(setpoint, now_s)
         if self.brain.connected:
             self.brain.send(self.state(now_s))
+
+    @property
+    def busy(self) -> bool:
+        """Something was told to move, and not to stop."""
+        return self.actuators.said != STOP or self.actuators.pumping
+
+    def hung(self) -> None:
+        """The watchdog stopped the devices past the loop: what they were told before holds no more."""
+        self.actuators.halt(self._clock.now())
 
     def _gate_state(self, setpoint: Setpoint | None, now_s: float) -> GateState:
         said = self.actuators.said

@@ -82,6 +82,26 @@ def test_everything_stops_when_the_brain_is_killed_or_blocked(tmp_path: Path, se
     story(tmp_path, tell)
 
 
+def test_a_fresh_body_has_its_outputs_latched_off_until_a_brain_of_its_own_sends_a_valid_setpoint(tmp_path: Path) -> None:
+    async def tell(rig: Any) -> None:
+        await rig.clock.sleep(3.0)
+        stranger = await rig.brain("not the secret of this robot")
+        stranger.wish = DRIVE
+        await rig.clock.sleep(1.0)
+        brain = await rig.brain()
+        for order in ("wake", "resume", "rest", "wake"):
+            brain.order(order)
+        await rig.clock.sleep(3.0)
+        assert not brain.state.stopped, "a start presses no e-stop"
+        assert {what for _, what in rig.base.log} == {("stop",)}
+        assert (rig.servos.moves, rig.servos.pump_log) == ([], [])
+        assert rig.servos.stops > 0
+        brain.wish = DRIVE
+        await rig.until(lambda: rig.base.doing[0] == "drive")
+
+    story(tmp_path, tell)
+
+
 def test_a_moving_arm_is_stopped_when_the_brain_goes(tmp_path: Path) -> None:
     async def tell(rig: Any) -> None:
         brain = await rig.brain()
