@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import os
 import secrets
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -58,8 +59,9 @@ class Line:
 
 @asynccontextmanager
 async def open_line(data: Path, role: str = "") -> AsyncIterator[Line]:
-    """With a `role`, requests carry that role's token."""
+    """With a `role`, requests carry that role's token. Without one they carry none, or that of `GARDEN_READS_AS`."""
     folder = Folder(data)
+    role = role or os.environ.get("GARDEN_READS_AS", "")
     clock, peers = WallClock(), Peers(folder.peers())
     mesh = Mesh(folder.transport(peers), folder.identity(role) if role else None, clock, timeout_s=3.0)
     try:

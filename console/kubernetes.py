@@ -122,7 +122,7 @@ def _container(process: Process, devices: dict[str, int]) -> dict[str, Any]:
         "image": IMAGE,
         "imagePullPolicy": "IfNotPresent",
         "command": ["python", "-m", process.module],
-        "env": [{"name": name, "value": value} for name, value in sorted(process.env.items())],
+        "env": [{"name": name, "value": value} for name, value in sorted(_environment(process).items())],
         "volumeMounts": mounts,
         "resources": {"requests": {"cpu": CPU[process.kind], "memory": memory}, "limits": {"memory": twice}},
         "securityContext": {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}},
@@ -131,12 +131,29 @@ def _container(process: Process, devices: dict[str, int]) -> dict[str, Any]:
         container["ports"] = [{"name": "http", "containerPort": process.port}]
         if process.kind == "sim":
             container["ports"] += [{"name": f"dev-{port}", "containerPort": port} for port in sorted(devices.values())]
-        container |= _probes("HTTPS" if "GARDEN_TLS" in process.env else "HTTP")
+        container |= _probes("HTTPS" if "GARDEN_TLS" in process.env else "HTTP", process.kind)
     return container
 
 
-def _probes(scheme: str) -> dict[str, Any]:
-    """Started: it answers within two minutes. Alive: it answers. Ready: it says so itself."""
+def _environment(process: Process) -> dict[str, str]:
+    """Pods are reached at addresses of the cluster, so reads take a token; the console's page, which shows none, stays
+    on its pod's loopback, where `kubectl port-forward` comes out. `garden` in its pod reads as the operator."""
+    if process.kind == "console":
+        return process.env | {"GARDEN_HOST": "127.0.0.1", "GARDEN_READS_AS": "operator"}
+    return process.env | {"GARDEN_OPEN_READS": "false"}
+
+
+def _probes(scheme: str, kind: str) -> dict[str, Any]:
+    """Started: it answers within two minutes. Alive: it answers. Ready: it says so itself.
+
+    Nobody but its own pod reaches the console, so it is asked from there.
+    """
+    if kind == "console":
+        inside = {"exec": {"command": ["python", "-m", "console.health"]}, "timeoutSeconds": 10}
+        return {
+            "startupProbe": inside | {"periodSeconds": 5, "failureThreshold": 24},
+            "livenessProbe": inside | {"periodSeconds": 60, "failureThreshold": 4},
+        }
     asked = {"port": "http"} | ({"scheme": scheme} if scheme != "HTTP" else {})
     alive = {"httpGet": {"path": "/healthz"} | asked, "timeoutSeconds": 5}
     return {

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from core.errors import ConfigError
 from core.mesh.node import Node
-from core.mesh.runtime import Runtime, key_folder, run
+from core.mesh.runtime import GardenSettings, Runtime, key_folder, reading, run
 from core.mesh.tls import by_address
 from hw.links import open_link
 from robot_service.brain import build
@@ -35,8 +35,37 @@ async def make(runtime: Runtime) -> Node:
         verifier=runtime.verifier,
         peers=runtime.peers,
         open_reads=runtime.settings.open_reads,
-        cameras=httpx.AsyncHTTPTransport(verify=by_address(key_folder(runtime.settings))) if runtime.settings.tls else None,
+        cameras=_cameras(runtime.settings),
     )
+
+
+class _Shown(httpx.AsyncBaseTransport):
+    """Shows this node's token to the world; no other camera is shown it."""
+
+    def __init__(self, inner: httpx.AsyncBaseTransport, world: str, headers: dict[str, str]) -> None:
+        self._inner, self._world, self._headers = inner, httpx.URL(world), headers
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        if _origin(request.url) == _origin(self._world):
+            request.headers.update(self._headers)
+        return await self._inner.handle_async_request(request)
+
+    async def aclose(self) -> None:
+        await self._inner.aclose()
+
+
+def _origin(url: httpx.URL) -> tuple[str, str, int | None]:
+    return url.scheme, url.host, url.port
+
+
+def _cameras(settings: GardenSettings) -> httpx.AsyncBaseTransport | None:
+    """The way to its cameras; None for plain HTTP that shows nothing."""
+    closed = not settings.open_reads
+    if not settings.tls and not closed:
+        return None
+    trusted = by_address(key_folder(settings), show=closed) if settings.tls else True
+    inner = httpx.AsyncHTTPTransport(verify=trusted)
+    return _Shown(inner, settings.clock, reading(settings)) if closed and settings.clock != "wall" else inner
 
 
 def main() -> None:

@@ -94,8 +94,14 @@ def make_clock(settings: GardenSettings) -> tuple[Clock, Sequence[Loop]]:
     from core.mesh import worldclock
 
     clock = WorldClock()
-    trusted = tls.by_address(key_folder(settings)) if settings.tls else None
-    return clock, (lambda: worldclock.follow(clock, settings.clock, tls=trusted),)
+    trusted = tls.by_address(key_folder(settings), show=not settings.open_reads) if settings.tls else None
+    shown = reading(settings)
+    return clock, (lambda: worldclock.follow(clock, settings.clock, tls=trusted, headers=shown),)
+
+
+def reading(settings: GardenSettings) -> dict[str, str]:
+    """The headers of what this node reads past the mesh: its token where reads are closed. Raises ConfigError."""
+    return {} if settings.open_reads else {"authorization": f"Bearer {Identity.load(key_folder(settings)).token}"}
 
 
 def key_folder(settings: GardenSettings) -> Path:

@@ -41,10 +41,15 @@ def asking(keys: Path) -> ssl.SSLContext:
     return context
 
 
-def by_address(keys: Path) -> ssl.SSLContext:
-    """To ask a host by its address: one of the garden, or one that the machine's own authorities vouch for. ConfigError."""
+def by_address(keys: Path, *, show: bool = False) -> ssl.SSLContext:
+    """To ask a host by its address: one of the garden, or one that the machine's own authorities vouch for. ConfigError.
+
+    With `show` it shows this node's certificate to those who ask for one.
+    """
     context = ssl.create_default_context()
     _trust(context, keys)
+    if show:
+        _show(context, keys)
     return context
 
 

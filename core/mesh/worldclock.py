@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import ssl
+from collections.abc import Mapping
 from typing import Annotated
 
 import httpx
@@ -26,17 +27,21 @@ class ClockBeat(Document):
 
 
 async def follow(
-    clock: WorldClock, url: str, http: httpx.AsyncClient | None = None, tls: ssl.SSLContext | None = None
+    clock: WorldClock,
+    url: str,
+    http: httpx.AsyncClient | None = None,
+    tls: ssl.SSLContext | None = None,
+    headers: Mapping[str, str] | None = None,
 ) -> None:
     """Steer `clock` by the feed at `url`, reconnecting for ever; a lost world stops it after SILENCE_S.
 
-    `url` is the world's address (`http://127.0.0.1:8090`); `tls` is for one of https. Waits in wall seconds: garden time
-    stands still meanwhile.
+    `url` is the world's address (`http://127.0.0.1:8090`); `tls` is for one of https, `headers` go with every
+    question. Waits in wall seconds: garden time stands still meanwhile.
     """
     feed_url = url.rstrip("/") + "/clock/feed"
     if http is not None:
         await _follow(clock, feed_url, http)
-    async with httpx.AsyncClient(verify=tls or True) as own:
+    async with httpx.AsyncClient(verify=tls or True, headers=headers) as own:
         await _follow(clock, feed_url, own)
 
 

@@ -70,7 +70,9 @@ def test_a_robots_brain_and_body_share_a_pod_and_a_socket_and_nothing_else_does(
 def test_whatever_answers_http_is_probed_and_nothing_runs_with_more_rights_than_it_needs() -> None:
     for container in containers():
         assert ("livenessProbe" in container) is ("ports" in container)
-        if "ports" in container:
+        if container["name"] == "console":
+            assert container["livenessProbe"]["exec"]["command"] == ["python", "-m", "console.health"]
+        elif "ports" in container:
             assert container["readinessProbe"]["httpGet"]["path"] == "/readyz"
             assert container["livenessProbe"]["httpGet"]["path"] == "/healthz"
         assert container["securityContext"] == {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}}
@@ -78,6 +80,14 @@ def test_whatever_answers_http_is_probed_and_nothing_runs_with_more_rights_than_
     for each in SETS.values():
         assert each["spec"]["template"]["spec"]["securityContext"]["runAsNonRoot"] is True
         assert each["spec"]["template"]["spec"]["automountServiceAccountToken"] is False
+
+
+def test_reads_are_open_on_loopback_only() -> None:
+    for container in containers():
+        env = {each["name"]: each["value"] for each in container["env"]}
+        closed = env.get("GARDEN_OPEN_READS") == "false"
+        assert closed or env["GARDEN_HOST"] == "127.0.0.1", container["name"]
+        assert closed or container["name"] == "console"
 
 
 def test_nobody_comes_in_but_the_garden_itself_and_device_wires_are_their_owners() -> None:
@@ -105,5 +115,6 @@ def test_under_tls_probes_shake_hands_too() -> None:
     assert len(told) == len(SETS)
     for document in objects:
         judge(document)
-    assert all(text.count('"httpGet"') == text.count('"scheme": "HTTPS"') > 0 for text in told)
+    assert all(text.count('"httpGet"') == text.count('"scheme": "HTTPS"') for text in told)
+    assert sum('"httpGet"' in text for text in told) == len(told) - 1, "all but the console's"
     assert not any("http://" in text for text in told)
