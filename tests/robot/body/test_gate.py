@@ -299,6 +299,14 @@ def test_fingers_that_feel_close() -> None:
         assert verdict == Verdict(command=Command(gripper_m=0.0))
 
 
+def test_where_fingers_stand_and_how_old_a_force_may_be_counts_to_the_last() -> None:
+    blind = replace(at(0.0, 0.0), gripper_m=gate.GRIP_SLACK_M, force_n=None)
+    assert passes(CLOSE, blind, 0.0)
+    assert not passes(CLOSE, replace(blind, gripper_m=gate.GRIP_SLACK_M + 1e-9), 0.0)
+    for age_s, fresh in ((0.0, True), (gate.FORCE_FRESH_S, True), (gate.FORCE_FRESH_S + 1e-9, False), (-1e-9, False)):
+        assert passes(CLOSE, replace(at(0.0, 0.0), force_s=-age_s), 0.0) == fresh
+
+
 def test_a_grip_that_is_held_stays_held_however_hard_it_squeezes() -> None:
     state = replace(GOOD, gripper_m=0.0, force_n=10.0)
     assert check(CLOSE, state, NOW_S).command == Command(gripper_m=0.0)
@@ -388,7 +396,7 @@ def test_news_counts_from_the_moment_it_came_to_the_end_of_its_life(field: str, 
 
 def test_the_limits_are_those_of_the_safety_rules() -> None:
     assert pytest.approx(0.24) == LIFE_S
-    assert (BASE_FRESH_S, SERVO_FRESH_S) == (0.5, 2.0)
+    assert (BASE_FRESH_S, SERVO_FRESH_S, gate.FORCE_FRESH_S, gate.PLACE_FRESH_S) == (0.5, 2.0, 0.8, 2.0)
     assert (SLOW_MPS, pytest.approx(0.224)) == (0.1, ARM_OUT_M)
 
 
