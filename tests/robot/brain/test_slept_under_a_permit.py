@@ -25,7 +25,7 @@ class Sleeper:
         self.turns += 1
         self.now_s += self._sleeps_s if self.turns == self._after else 0.2
         poured_ml = max(0.0, 2.0 * (self.turns - 1))
-        return SimpleNamespace(permit_id="p", pumped_ml=poured_ml, tank_ml=500.0, refusal="")
+        return SimpleNamespace(permit_id="p", pumped_ml=poured_ml, tank_ml=500.0, docked=True, refusal="")
 
 
 def test_a_robot_that_slept_before_the_pump_began_does_not_begin_when_its_permit_is_over():
