@@ -6,6 +6,7 @@ import asyncio
 import json
 import math
 import random
+import sys
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -29,6 +30,8 @@ from plant_service.node import build
 from plant_service.settings import DockSettings, PlantSettings
 from sim.devices.firmata import FirmataEmulator
 from sim.devices.host import EmulatorHost
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 SOIL_ML = 3000.0
 EYES = [(0.45, y, z) for z in (0.12, 0.32) for y in (-0.15, 0.0, 0.15)]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from tracing import untraceable
 
 from core.store import DurableDocument
 
@@ -44,17 +44,9 @@ FAULTS = [
 """Call, error, and that every so many-th call fails."""
 
 
-def traced() -> str:
-    """Why a process cannot be traced here; empty when it can."""
-    if shutil.which("strace") is None:
-        return "strace is not installed (Debian package strace)"
-    tried = subprocess.run(["strace", "-o", "/dev/null", "true"], capture_output=True, text=True, check=False)
-    return "" if tried.returncode == 0 else f"strace may not trace here: {tried.stderr.strip()[:100]}"
-
-
 @pytest.mark.parametrize(("call", "error", "every"), FAULTS, ids=lambda value: str(value))
 def test_a_system_call_that_fails_is_never_answered_with_success(tmp_path: Path, call: str, error: str, every: int) -> None:
-    if why := traced():
+    if why := untraceable():
         pytest.skip(why)
     folders = [tmp_path / str(k) for k in range(FILES)]
     for folder in folders:
