@@ -152,13 +152,16 @@ def joining(courier: Courier | None, identity: Identity | None, node: Node) -> S
 def setup_logging(how: str = "auto") -> None:
     """structlog to stderr: JSON lines, or text on a terminal. The standard library's warnings go the same way."""
     text = how == "text" or (how == "auto" and sys.stderr.isatty())
-    final = structlog.dev.ConsoleRenderer() if text else structlog.processors.JSONRenderer()
+    # Without what variables held: tokens and keys are among them, and rich pictures of them take a second of the loop.
+    plain = structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
+    stack = structlog.processors.ExceptionRenderer(structlog.tracebacks.ExceptionDictTransformer(show_locals=False))
+    final = plain if text else structlog.processors.JSONRenderer()
     structlog.configure(
         processors=[
             structlog.contextvars.merge_contextvars,
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso"),
-            structlog.processors.dict_tracebacks if not text else structlog.processors.StackInfoRenderer(),
+            structlog.processors.StackInfoRenderer() if text else stack,
             final,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
