@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -47,12 +48,12 @@ def forker(folder: Path, port: int, under: Sequence[str] = ()) -> Iterator[subpr
     }  # fmt: skip
     with subprocess.Popen(
         [*under, sys.executable, "-c", FORKER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-        env=environment, bufsize=0,
+        env=environment, bufsize=0, start_new_session=True,
     ) as process:  # fmt: skip
         try:
             yield process
         finally:
-            process.kill()
+            os.killpg(process.pid, signal.SIGKILL)  # the pot as well
 
 
 def call(port: int, method: str, path: str, token: str = "", body: object = None) -> tuple[int, bytes]:
