@@ -38,6 +38,8 @@ LONG_REST_S, LONG_REST_DT_S = 120.0, 10.0
 """After so long a rest turns come so seldom; whatever is wanted wakes the body at once."""
 WAKING_S = 1.0
 """After a rest the readings need a moment; a refusal for want of them is not worth telling so soon."""
+KEEP_AGAIN_S = 5.0
+"""A stop that the disk did not take is written down again so soon."""
 _log = structlog.get_logger("robot.body")
 Loop = Callable[[], Awaitable[None]]
 
@@ -256,8 +258,13 @@ class BodyNode:
             _log.warning("an order was dropped: too many at once", order=control.order)
 
     async def _obey(self) -> None:
+        """Orders in their turn. A stop that could not be written down is written later: until then nobody can release it."""
         while True:
-            control = await self._orders.get()
+            try:
+                async with self._clock.timeout(KEEP_AGAIN_S if self.latch.unwritten else None):
+                    control = await self._orders.get()
+            except TimeoutError:
+                control = Control(order="stop", by=self.latch.by)
             try:
                 done = await self._latch(control)
                 _log.warning("e-stop", order=control.order, by=control.by, number=control.stop_number, done=done)

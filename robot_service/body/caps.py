@@ -146,6 +146,11 @@ class StopLatch:
         """
         return self._number if self.stopped and self.kept else 0
 
+    @property
+    def unwritten(self) -> bool:
+        """It is latched, no disk knows, and one may yet: a disk was full or failed once, or an order was lost."""
+        return self.stopped and not self.kept and not self._document.broken
+
     def close(self) -> None:
         self._document.close()
 

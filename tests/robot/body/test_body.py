@@ -20,6 +20,7 @@ from core.virtual import run_virtual
 from core.wire.body import Setpoint
 from core.wire.geometry import Pose2
 from hw.ports import BaseReading, MarkerFix
+from robot_service.body.body import KEEP_AGAIN_S
 from robot_service.body.whereabouts import Whereabouts
 
 _spec = importlib.util.spec_from_file_location("body_stand_ins", Path(__file__).with_name("stand_ins.py"))
@@ -300,6 +301,28 @@ def test_a_release_of_an_earlier_stop_releases_no_later_one(tmp_path: Path) -> N
 
     for part in (press, say_it_again):
         story(tmp_path, part)
+
+
+def test_a_stop_that_a_full_disk_did_not_take_is_written_down_later_and_can_then_be_released(tmp_path: Path) -> None:
+    async def tell(rig: Any) -> None:
+        def fail(doc: object) -> int:
+            raise StorageError("no space left")
+
+        document = rig.body.latch._document
+        real, document.commit = document.commit, fail
+        brain = await rig.brain()
+        brain.wish = DRIVE
+        await rig.until(lambda: rig.base.doing[0] == "drive")
+        brain.order("stop", "anna")
+        await rig.clock.sleep(3 * KEEP_AGAIN_S)
+        assert (brain.state.stopped, brain.state.stop_kept, brain.state.stop_number) == (True, False, 0)
+        document.commit = real
+        await rig.clock.sleep(KEEP_AGAIN_S + 1.0)
+        assert (brain.state.stopped, brain.state.stop_kept, brain.state.stop_number) == (True, True, 1)
+        brain.order("resume", "anna", 1)
+        await rig.until(lambda: rig.base.doing[0] == "drive")
+
+    story(tmp_path, tell)
 
 
 def test_a_damaged_latch_refuses_to_start(tmp_path: Path) -> None:
