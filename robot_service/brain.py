@@ -223,7 +223,7 @@ class Brain:
             current=None if begun is None else self._stop(begun),
             at_work_s=0.0 if begun is None else self._at_work_s(begun),
             queue=tuple(self._stop(entry) for entry in self.queue.waiting),
-            taps=tuple(dock.name for dock in docks if dock.tap and not self.robot.fitness.why_not(dock.name)),
+            taps=tuple(name for name, dry in self.robot.taps().items() if not dry),
             chargers=tuple(dock.name for dock in docks),
         )
 

@@ -146,6 +146,10 @@ class Robot:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
 
+    def taps(self) -> dict[str, str]:
+        """Docks with a tap by name, and why each is not counted on now; empty for those that are."""
+        return {dock.name: self.fitness.why_not(dock.name) for dock in self.settings.map.docks if dock.tap}
+
     def dock(self, name: str) -> KnownDock:
         if (dock := self.settings.map.dock(name)) is None:
             raise SkillFailed(f"no dock {name} on the map")

@@ -112,8 +112,8 @@ class Scheduler:
 
     def _no_water(self) -> str:
         """Why no tap gives water; empty when one may."""
-        dry = {dock.name: self.robot.fitness.why_not(dock.name) for dock in self.robot.settings.map.docks if dock.tap}
-        return "; ".join(dry.values()) if all(dry.values()) else ""
+        dry = self.robot.taps().values()
+        return "; ".join(dry) if all(dry) else ""
 
     # ------------------------------------------------------------------ the loop
     async def run(self) -> None:

@@ -60,13 +60,9 @@ class Identity:
     @classmethod
     def load(cls, folder: Path) -> Identity:
         """Read `folder/token`, and `card` and `node.key` where they are; raises ConfigError when there is no token."""
-        token = keyfiles.read(folder / "token").decode("ascii", "replace").strip()
-        card, key = "", None
+        token, card, key = _text(folder / "token"), "", None
         if (folder / "card").exists() and (folder / "node.key").exists():
-            card, key = (
-                keyfiles.read(folder / "card").decode("ascii", "replace").strip(),
-                GardenKey.load(folder / "node.key").key,
-            )
+            card, key = _text(folder / "card"), GardenKey.load(folder / "node.key").key
         try:
             claims = jwt.decode(token, options={"verify_signature": False})
             return cls(str(claims["sub"]), str(claims["role"]), token, card, key)
@@ -287,8 +283,12 @@ def _alive(folder: Path, garden: GardenKey, now_s: float) -> bool:
     """Whether token and card are there and hold."""
     verifier = garden.verifier()
     try:
-        verifier.verify(keyfiles.read(folder / "token").decode("ascii", "replace").strip(), now_s)
-        verifier.card(keyfiles.read(folder / "card").decode("ascii", "replace").strip(), now_s)
+        verifier.verify(_text(folder / "token"), now_s)
+        verifier.card(_text(folder / "card"), now_s)
     except (Unauthorised, ConfigError):
         return False
     return True
+
+
+def _text(path: Path) -> str:
+    return keyfiles.read(path).decode("ascii", "replace").strip()

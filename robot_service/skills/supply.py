@@ -66,12 +66,11 @@ def chargers(known: list[KnownDock], travel: Travel) -> list[KnownDock]:
 
 async def refill(robot: Robot, docks: Docks, travel: Travel) -> None:
     """Dock at the nearest tap that is not known to be dry, and fill the tank by its own sensor."""
-    docks_of_taps = [dock.name for dock in robot.settings.map.docks if dock.tap]
-    times = {name: travel("here", name) for name in docks_of_taps if not robot.fitness.why_not(name)}
+    known = robot.taps()
+    times = {name: travel("here", name) for name, dry in known.items() if not dry}
     taps = sorted((time_s, name) for name, time_s in times.items() if time_s is not None)
     if not taps:
-        dry = [why for name in docks_of_taps if (why := robot.fitness.why_not(name))]
-        raise SkillFailed("; ".join(dry) or "no tap can be reached")
+        raise SkillFailed("; ".join(filter(None, known.values())) or "no tap can be reached")
     dock = robot.dock(taps[0][1])
     await dock_at(robot, docks, dock.name)
     robot.activity.job = "refill"
