@@ -12,7 +12,7 @@ from core.errors import Forbidden
 from core.growth.stages import DAY_S
 from core.history import as_csv
 from core.mesh.auth import Caller
-from core.mesh.chassis import allow, body, raw, serve_direct, serve_ready
+from core.mesh.chassis import IdempotencyKey, allow, body, raw, serve_direct, serve_ready
 from core.mesh.guard import header
 from core.wire.documents import HistoryEntry
 from core.wire.fruit import Colour, Forecast, Fruit, Inventory, LedgerLine, NewFruit, Scan
@@ -42,7 +42,6 @@ from plant_service.pot import Pot
 from plant_service.station import Station
 
 Id = Annotated[str, Path(max_length=80)]
-IdempotencyKey = Annotated[str, Header(max_length=128)]
 JSON = "application/json"
 
 

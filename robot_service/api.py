@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
-from fastapi import FastAPI, Header, Path, Query, Response
+from fastapi import FastAPI, Path, Query, Response
 from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from core.errors import Unavailable
 from core.history import as_csv
 from core.mesh.auth import ROLES, Caller, Verifier
-from core.mesh.chassis import allow, body, create_app, serve_direct
+from core.mesh.chassis import IdempotencyKey, allow, body, create_app, serve_direct
 from core.mesh.metrics import measure
 from core.wire.documents import HistoryEntry
 from core.wire.market import Announcement, Award, Bid
@@ -140,7 +140,7 @@ def _jobs(app: FastAPI, brain: Brain) -> None:
         response: Response,
         caller: Caller = allow("operator"),
         wish: JobRequest = body(JobRequest),
-        idempotency_key: Annotated[str, Header(max_length=128)] = "",
+        idempotency_key: IdempotencyKey = "",
     ) -> Job:
         job = brain.add_job(wish, caller.subject, idempotency_key)
         response.headers["location"] = f"/jobs/{job.job_id}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from importlib import metadata
-from typing import Any
+from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, Header, Query, Request
 from fastapi.exceptions import RequestValidationError
@@ -27,6 +27,8 @@ from core.mesh.problems import problem_response
 from core.mesh.strict import body, no_surplus, parse, plain_read, raw
 from core.wire.documents import Document, HistoryEntry, NodeCard
 
+IdempotencyKey = Annotated[str, Header(max_length=128)]
+"""Of a route that remembers its keys longer than the guard does."""
 SSE_SILENCE_S = 15.0
 
 __all__ = ["Allow", "allow", "body", "create_app", "parse", "raw", "serve_direct", "serve_ready", "version"]
