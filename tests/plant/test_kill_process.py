@@ -12,24 +12,24 @@ from pathlib import Path
 
 from pot_process import FRUIT, born, call, forker, free_port
 
-KILLS = 20
+KILLS, WRITES_MAX = 20, 20
+"""All that they add is less than an inventory holds."""
 
 
-def add_until_killed(port: int, token: str, pid: int, lives_s: float) -> set[str]:
-    """Ids acknowledged before the kill, which comes in the middle of a request."""
+def add_until_killed(port: int, token: str, pid: int, writes: int, dies_after_s: float) -> set[str]:
+    """Ids acknowledged before the kill, which comes so long after one more request was sent."""
     acknowledged: set[str] = set()
-    dies = time.monotonic() + lives_s
-    while True:
-        if time.monotonic() >= dies:
-            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
-            headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
-            connection.request("POST", "/inventory/fruits", json.dumps(FRUIT), headers)
-            os.kill(pid, signal.SIGKILL)
-            connection.close()
-            return acknowledged
+    for _ in range(writes):
         status, answer = call(port, "POST", "/inventory/fruits", token, FRUIT)
         assert status == 201
         acknowledged.add(json.loads(answer)["fruit_id"])
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
+    connection.request("POST", "/inventory/fruits", json.dumps(FRUIT), headers)
+    time.sleep(dies_after_s)
+    os.kill(pid, signal.SIGKILL)
+    connection.close()
+    return acknowledged
 
 
 def test_twenty_kills_of_a_whole_pot_lose_nothing_acknowledged(tmp_path: Path) -> None:
@@ -46,6 +46,6 @@ def test_twenty_kills_of_a_whole_pot_lose_nothing_acknowledged(tmp_path: Path) -
             found = [fruit["fruit_id"] for fruit in json.loads(answer)["fruits"]]
             assert len(found) == len(set(found))
             assert acknowledged <= set(found), f"kill {kill}: lost {acknowledged - set(found)}"
-            acknowledged |= add_until_killed(port, token, pid, rng.uniform(0.01, 0.12))
+            acknowledged |= add_until_killed(port, token, pid, rng.randint(1, WRITES_MAX), rng.uniform(0.0, 0.004))
     assert len(acknowledged) > KILLS
     assert not list((tmp_path / "data").glob("*.bad-*"))
