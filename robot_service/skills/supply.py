@@ -18,7 +18,7 @@ AIM_ML = gardener.TANK_ML - 20.0
 """Fill to here: the sensor's steps and noise stay below the brim."""
 FULL_ML = AIM_ML - 20.0
 READ_S = 2.0
-"""A resting board tells a new level at least this often."""
+"""So long after the tap has closed the level is told."""
 FIRST_OPEN_S = 10.0
 TAP_STALL_S = 15.0
 CHARGE_S_MAX = 4 * 3600.0
@@ -74,7 +74,8 @@ async def refill(robot: Robot, docks: Docks, travel: Travel) -> None:
     dock = robot.dock(taps[0][1])
     await dock_at(robot, docks, dock.name)
     robot.activity.job = "refill"
-    robot.body.rest(True)
+    # A body that rests tells the level too seldom: by an old one the tank runs over, or the tap seems dry.
+    robot.body.rest(False)
     await _fill(robot, dock)
 
 

@@ -48,6 +48,21 @@ def test_a_robot_with_too_little_water_prices_the_tap_and_goes_there_first():
     story.tell(story.one_pot(tank_ml=60.0), told)
 
 
+def test_a_robot_that_has_long_rested_at_the_tap_fills_its_tank_to_the_brim_and_no_further():
+    async def told(garden):
+        await ready(garden)
+        assert (await job(garden, kind="dock", at="station/tap"))["state"] == "done"
+        await garden.clock.sleep(180.0)
+        assert story.robot(garden).docked_at == "station/tap"
+        answer = await garden.post("plant-1", "/tasks", {"kind": "water", "dose_ml": 100.0})
+        assert answer.status_code == 201, answer.text
+        await story.served(garden, "plant-1")
+        assert garden.truth().tap_ml > 1340.0
+        story.unhurt(garden)
+
+    story.tell(resting(tank_ml=60.0, spread_after_s=0.0), told)
+
+
 def test_a_robot_whose_battery_is_low_charges_by_itself():
     async def told(garden):
         await story.when(garden, lambda: story.robot(garden).charging, 120.0)
