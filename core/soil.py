@@ -53,17 +53,17 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One sampling: garden time [s] and its voltages [V]."""
+    """One sampling: when it was begun [garden s] and its voltages [V]."""
 
     stamp_s: float
     samples_v: tuple[float, ...]
 
 
-def remember(history: Sequence[Reading], samples_v: Sequence[float], now_s: float, limits: Limits) -> tuple[Reading, ...]:
+def remember(history: Sequence[Reading], samples_v: Sequence[float], stamp_s: float, limits: Limits) -> tuple[Reading, ...]:
     """The history with a new reading, no longer than `judge` needs; an empty sampling changes nothing."""
     if not samples_v:
         return tuple(history)
-    return (*history, Reading(now_s, tuple(samples_v)))[-limits.stuck_readings :]
+    return (*history, Reading(stamp_s, tuple(samples_v)))[-limits.stuck_readings :]
 
 
 def judge(

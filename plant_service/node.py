@@ -114,8 +114,12 @@ def build_pot(parts: _Parts) -> Node:
     stored = parts.file("inventory", GATHER_S)
     fruits = Keeper(stored, InventoryDocument, lambda doc: Fruits(settings.id, doc), texts.stored)
 
+    read = 0
+
     def revived(doc: MarketDocument | None) -> Market:
-        market = Market(card, doc, clock.now(), limits=limits)
+        nonlocal read
+        read += 1
+        market = Market(card, doc, clock.now(), limits=limits, same_clock=read > 1)
         market.fruits(fruits.machine.inventory.fruits, clock.now())
         return market
 

@@ -208,10 +208,11 @@ class Pot:
 
     async def measure(self) -> None:
         """Take one reading and judge it."""
+        asked_s = self._clock.now()
         samples_v = await self._sample()
         now_s = self._clock.now()
         state, ratio = soil.judge(samples_v, self._readings, now_s, self._limits)
-        self._readings = soil.remember(self._readings, samples_v, now_s, self._limits)
+        self._readings = soil.remember(self._readings, samples_v, asked_s, self._limits)
         if state is not self._state:
             self.journal.note("probe", f"soil probe {self._why(state) or 'good'}", state=state.value)
         if state is not self._state or now_s - self._kept_s >= KEEP_READING_S:
@@ -223,7 +224,9 @@ class Pot:
     async def think(self) -> None:
         """Tell the market what was measured, and ask for water or take the asking back."""
         ratio, state = self._ratio, self._state or ProbeState.DOWN
-        await self.place.change(lambda m, now_s: m.soil(ratio, self._why(state), now_s))
+        # A reading that failed leaves the one before standing for a while, and this process may have slept since.
+        stamp_s = self._readings[-1].stamp_s if self._readings else None
+        await self.place.change(lambda m, now_s: m.soil(ratio, self._why(state), now_s, stamp_s))
         self._feel(ratio)
         if self._should_ask():
             await self._ask()

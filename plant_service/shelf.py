@@ -50,10 +50,6 @@ class Shelf:
         headers = {"location": f"/inventory/fruits/{added.fruit_id}", "etag": now}
         return Response(added.model_dump_json(exclude_none=True), 201, headers, media_type=JSON)
 
-    def now(self) -> Response:
-        """The inventory as the machine has it: for who has just waited for it to be durable."""
-        return self._answer(self._keeper.machine.inventory)
-
     async def remove(self, fruit_id: str, if_match: str) -> str:
         """The ETag afterwards; raises PreconditionFailed or NotFound."""
         return etag(await self._keeper.change(lambda fruits: fruits.remove(fruit_id, if_match)))

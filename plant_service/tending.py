@@ -80,13 +80,13 @@ class Tending:
         machine, now_s = self._fruits.machine, self._clock.now()
         if machine.knows(scan.scan_id):
             await self._fruits.settle()
-            return self.shelf.now()
+            return self.shelf.whole()
         market = self._place.market
         if scan.task_id and robot_id:
             market.check_scan(scan.task_id, robot_id)
         doubts, undecided = market.doubts, market.undecided(now_s)
         merged = await self._fruits.change(lambda fruits: fruits.merge(scan, now_s, doubts, undecided))
-        answer = self.shelf.now()
+        answer = self.shelf.whole()
         await self._settled(merged.settled, now_s)
         if scan.task_id and robot_id:
             await self._place.change(lambda m, at_s: m.scanned(scan.task_id, robot_id, scan.scan_id, at_s))

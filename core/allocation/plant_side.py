@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from core.allocation.picking import Picking, picked, settles, told
-from core.allocation.plant_state import Keyed, Limits, Live, MarketDocument, Note, Rules
+from core.allocation.plant_state import Keyed, Limits, Live, MarketDocument, Note, Rules, Soil
 from core.allocation.tasks import TaskBook
 from core.allocation.watering import Measured, Watering
 from core.errors import Conflict, Refused
@@ -32,16 +32,21 @@ class Market(TaskBook):
         now_s: float,
         rules: Rules | None = None,
         limits: Limits | None = None,
+        *,
+        same_clock: bool = False,
     ) -> None:
+        """Goes on from `document`; `same_clock`: it is of this process, whose last change could not be saved."""
         before = document or MarketDocument()
         super().__init__(card, before, now_s, rules)
         self.limits = limits or Limits()
-        self._water = Watering(before.open_permit, before.doses, now_s, self.limits, before.doses_at_s)
-        self._picks = Picking(before.open_pick, before.doubts, now_s)
+        self._water = Watering(
+            before.open_permit, before.doses, now_s, self.limits, before.doses_at_s, same_clock=same_clock
+        )
+        self._picks = Picking(before.open_pick, before.doubts, now_s, same_clock=same_clock)
         self._scanned = dict(before.scanned)
         if (held := self._water.open) is not None:
             task = self._tasks.get(held.permit.task_id)
-            self._water.revive(task_open=task is not None and task.state not in FINAL_STATES)
+            self._water.revive(now_s, task_open=task is not None and task.state not in FINAL_STATES)
         if (pick := self._picks.open) is not None and not self._is_live(pick.permit.task_id):
             self._picks.doubt()
 
@@ -151,14 +156,16 @@ class Market(TaskBook):
         self._doubt_pick_of(task, now_s)
         return self._finish(task, "cancelled", f"cancelled by {by}: {why}" if why else f"cancelled by {by}", now_s)
 
-    def soil(self, ratio: float | None, why: str, now_s: float) -> None:
+    def soil(self, ratio: float | None, why: str, now_s: float, stamp_s: float | None = None) -> None:
         """A judged reading: the water content, or None and why. Settles an open permit when its time has come.
 
+        `stamp_s` is when it was taken [garden s], None for now: what stood before a dose cannot tell whether it arrived.
         Tells of water that no dose explains.
         """
-        if (measured := self._water.measured(ratio, why, now_s)) is not None:
+        reading = Soil(ratio, why, now_s if stamp_s is None else stamp_s)
+        if (measured := self._water.measured(reading, now_s)) is not None:
             self._settle_dose(measured, now_s)
-        if told := self._water.unasked(now_s):
+        if told := self._water.unasked():
             self._effects.append(Note("unasked", told, "", ""))
 
     def fruits(self, fruits: Iterable[Fruit], now_s: float) -> None:

@@ -44,9 +44,9 @@ class _Watch:
     """Until then a dose may still soak in."""
     lowest: float = math.inf
 
-    def see(self, ratio: float, now_s: float) -> str:
+    def see(self, ratio: float, stamp_s: float) -> str:
         """What rose without a dose, once; empty when nothing did."""
-        if now_s < self.since_s:
+        if stamp_s < self.since_s:
             return ""
         before, self.lowest = self.lowest, min(self.lowest, ratio)
         if ratio - self.lowest < UNASKED_RISE:
@@ -68,13 +68,17 @@ class Watering:
         now_s: float,
         limits: Limits,
         doses_at_s: float | None = None,
+        *,
+        same_clock: bool = False,
     ) -> None:
         """`doses_at_s` is the time of the clock of before at which the doses were written down."""
         self.limits = limits
         self.soil = Soil(None, "not measured yet", -math.inf)
-        self.doses, self.at_s = permits.revived(doses, doses_at_s, now_s), now_s
-        # The clock of before may not be this one: an open permit waits its whole time anew.
-        self.open = None if open_permit is None else open_permit.model_copy(update={"issued_s": now_s})
+        self.doses, self.at_s = permits.revived(doses, now_s if same_clock else doses_at_s, now_s), now_s
+        self.open = open_permit
+        if open_permit is not None and not same_clock:
+            # The clock of before may not be this one: an open permit waits its whole time anew.
+            self.open = open_permit.model_copy(update={"issued_s": now_s})
         self.settle_at_s = math.inf
         self._watch = _Watch(math.inf if self.open is not None else now_s + limits.soak_s)
 
@@ -126,23 +130,23 @@ class Watering:
             return
         self.settle_at_s = max(now_s, self.open.act_over_s()) + self.limits.soak_s
 
-    def revive(self, *, task_open: bool) -> None:
-        """After a restart: when the open permit settles without anybody's word."""
+    def revive(self, now_s: float, *, task_open: bool) -> None:
+        """Read back from its document: when the open permit settles without anybody's word."""
         if self.open is not None and self.open.finished:
-            self.settle_at_s = self.open.valid_until_s() + self.limits.soak_s
+            self.settle_at_s = max(now_s, self.open.valid_until_s()) + self.limits.soak_s
         elif self.open is not None and not task_open:
-            self.settle_at_s = self.open.act_over_s() + self.limits.soak_s
+            self.settle_at_s = max(now_s, self.open.act_over_s()) + self.limits.soak_s
 
-    def unasked(self, now_s: float) -> str:
+    def unasked(self) -> str:
         """What the newest reading tells of water that no dose explains, once; empty when nothing."""
-        return "" if self.soil.ratio is None else self._watch.see(self.soil.ratio, now_s)
+        return "" if self.soil.ratio is None else self._watch.see(self.soil.ratio, self.soil.stamp_s)
 
-    def measured(self, ratio: float | None, why: str, now_s: float) -> Measured | None:
-        """A judged reading; settles the open permit when its time has come."""
-        self.soil, self.at_s = Soil(ratio, why, now_s), now_s
-        if self.open is None or ratio is None or now_s < self.settle_at_s:
+    def measured(self, soil: Soil, now_s: float) -> Measured | None:
+        """A judged reading; settles the open permit when it was taken after the dose had soaked in."""
+        self.soil, self.at_s = soil, now_s
+        if self.open is None or soil.ratio is None or soil.stamp_s < self.settle_at_s:
             return None
-        settled = Measured(self.open, ratio)
+        settled = Measured(self.open, soil.ratio)
         self.open, self.settle_at_s = None, math.inf
         self._watch.rest(now_s + self.limits.soak_s)
         return settled

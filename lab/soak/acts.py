@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from dataclasses import replace
 
 from core.allocation.permits import DAY_S
 from core.allocation.plant_state import Limits
@@ -64,7 +65,7 @@ class Acts:
         if held.robot_id != dose.robot_id or held.plant_id != dose.plant_id:
             case.breach("I1", f"{dose.robot_id} pumps at {dose.plant_id} under {held.robot_id}'s permit {held.permit_id}")
         earlier = self._truth.doses[: dose.number]
-        late_s = dose.began_s - held.issued_s - held.valid_s * SKEW
+        late_s = dose.began_s - held.until_s
         if late_s > BEGIN_S and not any(d.permit_id == dose.permit_id for d in earlier):
             case.breach("I2", f"{dose.robot_id} began {late_s:.1f} s after permit {held.permit_id} had run out")
         for other in self._truth.doses[-8:]:
@@ -112,7 +113,11 @@ class Acts:
     def given(self, message: Message, answer: Answer) -> None:
         """I1, I2: a permit leaves its plant."""
         case, said, now_s = self._case, json.loads(answer.body), self._truth.now()
-        if said["permit_id"] in case.permits:
+        life, until_s = case.garden.running[message.target].life, now_s + said["valid_for_s"] * SKEW
+        if (known := case.permits.get(said["permit_id"])) is not None:
+            if known.life is not life:
+                # A plant that was started anew does not know how long ago it gave it: its whole time counts anew.
+                case.permits[known.permit_id] = replace(known, until_s=until_s, life=life)
             return
         epoch = max((e for task_id, e in case.awards if task_id == said["task_id"]), default=-1)
         holder = case.awards.get((said["task_id"], epoch), "nobody")
@@ -120,7 +125,7 @@ class Acts:
             case.breach("I1", f"{said['task_id']} is {holder}'s, epoch {epoch}, and {message.source} got a permit")
         permit = Given(
             said["permit_id"], said["task_id"], message.source, message.target, said["act"], said["epoch"], said["dose_ml"],
-            now_s, said["valid_for_s"],
+            now_s, until_s, life,
         )  # fmt: skip
         case.permits[permit.permit_id] = permit
         if permit.act != "water":

@@ -35,7 +35,10 @@ class Given:
     epoch: int
     dose_ml: float
     issued_s: float
-    valid_s: float
+    until_s: float
+    """When its act must have begun."""
+    life: object
+    """The life of its plant that said so."""
 
 
 @dataclass(slots=True)

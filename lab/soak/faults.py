@@ -47,10 +47,13 @@ FATAL = {
     "death_after_act": 0.10, "death_before_act": 0.05, "crash_after_permit": 0.05, "crash_after_award": 0.05,
     "crash_on_end": 0.05, "crash_writing_award": 0.06, "crash_writing_permit": 0.10, "pause_under_permit": 0.10,
     "permit_lost_in_crash": 0.06, "permit_asked_late": 0.06, "power_cycle_while_stopped": 0.3,
+    "probe_silent_after_act": 0.05,
 }  # fmt: skip
-"""Chance that a process dies, or sleeps, at this instant."""
+"""Chance that a process dies or sleeps, or that a probe falls silent, at this instant."""
 DISK = ("crash_before_write", "crash_in_write", "crash_after_write", "disk_eio", "disk_enospc", "torn_write", "fsync_error")
 LATE_PERMIT_S = (10.0, 60.0)
+SOAKING_S = (0.0, 75.0)
+"""A probe falls silent so long after a dose: before, when, or just after it should tell whether the water arrived."""
 MEND_AFTER_S = 45.0
 WEAK_RATIO = 0.6
 """A robot with less than this would charge for most of a calm, and its tasks wait for it."""
@@ -277,9 +280,10 @@ class Gremlin:
         self.truth.water_out = False
         self.touch("station", body.name)
 
-    async def _probe(self) -> None:
-        plant_id = self.rng.choice(self.garden.names("plant"))
-        self.strike("probe_silent", plant_id)
+    async def _probe(self, plant_id: str = "", kind: str = "probe_silent", after_s: float = 0.0) -> None:
+        plant_id = plant_id or self.rng.choice(self.garden.names("plant"))
+        await asyncio.sleep(after_s)
+        self.strike(kind, plant_id)
         self.truth.pots[plant_id].probe_silent = True
         await asyncio.sleep(self.rng.uniform(60.0, 900.0))
         self.truth.pots[plant_id].probe_silent = False
@@ -411,6 +415,8 @@ class Gremlin:
     def _poured(self, dose: Dose) -> None:
         if self.on and dose.ml > 1.0 and self._chance(FATAL["death_after_act"]):
             self._later(self.crash(dose.robot_id, "death_after_act"))
+        if self.on and self._chance(FATAL["probe_silent_after_act"]):
+            self._later(self._probe(dose.plant_id, "probe_silent_after_act", self.rng.uniform(*SOAKING_S)))
 
     def _picked(self, robot_id: str, permit_id: str) -> None:
         if self.on and self._chance(FATAL["death_after_act"]):

@@ -84,9 +84,10 @@ class Papers:
             self._documents[plant_id] = document
             self._market(plant_id, pot, document)
         self._met_before[plant_id] = self._faults(plant_id)
-        if self._inventories.get(plant_id) is not pot.tending._fruits.machine.inventory:
-            self._inventories[plant_id] = pot.tending._fruits.machine.inventory
-            self._fruits(plant_id, pot, pot.tending._fruits.machine.inventory)
+        stored = pot.tending._fruits.durable
+        if stored is not None and self._inventories.get(plant_id) is not stored.inventory:
+            self._inventories[plant_id] = stored.inventory
+            self._fruits(plant_id, pot, stored.inventory)
         return document.tasks
 
     def _market(self, plant_id: str, pot: Pot, document: MarketDocument) -> None:

@@ -52,6 +52,8 @@ class Soil:
     rng: random.Random
     ratio: float
     fault: Callable[[], float] | None = None
+    silent: bool = False
+    """The board sends nothing, and its link stays up."""
     levels: dict[int, bool] = field(default_factory=dict)
 
     def analog_v(self, pin: int) -> float:
@@ -271,12 +273,14 @@ class Garden:
         woken = asyncio.Event()
         host = EmulatorHost(emulator, self.clock, wake=woken.set)
         host.listen(self.net, name)
-        self.tasks.append(asyncio.get_running_loop().create_task(self._firmware(host, woken)))
+        self.tasks.append(asyncio.get_running_loop().create_task(self._firmware(soil, host, woken)))
         return soil
 
-    async def _firmware(self, host: EmulatorHost, woken: asyncio.Event) -> None:
+    async def _firmware(self, soil: Soil, host: EmulatorHost, woken: asyncio.Event) -> None:
         while True:
             woken.clear()
+            while soil.silent:
+                await self.clock.sleep(0.1)
             host.pump(self.clock.now())
             wait_s = host.due_s() - self.clock.now()
             try:

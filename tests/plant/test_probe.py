@@ -96,6 +96,30 @@ def test_a_probe_that_fails_after_the_dose_leaves_the_task_open_and_says_why(pla
     play(story)
 
 
+def test_what_a_probe_said_before_it_fell_silent_does_not_tell_whether_a_dose_arrived(play: Play) -> None:
+    async def story(garden: Garden) -> None:
+        robot = garden.robot("robot-1")
+        robot.pump_blocked = True
+        garden.pot(ratio=0.195, soak_s=40.0)
+
+        async def waits_to_measure() -> bool:
+            return str((await garden.state())["waiting"]).startswith("measuring again in 5 s")
+
+        await garden.until(waits_to_measure, 120.0)
+        soil = garden.soils["plant-1"]
+        soil.silent = True
+        await garden.clock.sleep(20.0)
+        seen = await garden.state()
+        assert (seen["soil"]["state"], seen["soil"]["age_s"] > 15.0) == ("good", True)
+        assert (await garden.task())["state"] == "running"
+        robot.pump_blocked = soil.silent = False
+        await garden.until_task("done")
+        told = [event["what"] for event in (await garden.task())["events"]]
+        assert sum("the dose did not arrive" in what for what in told) == 1
+
+    play(story)
+
+
 def test_a_fault_between_award_and_permit_stops_the_dose(play: Play) -> None:
     async def story(garden: Garden) -> None:
         robot = garden.robot("robot-1")

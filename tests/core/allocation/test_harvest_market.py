@@ -155,6 +155,8 @@ def test_the_times_of_a_pick_are_reckoned_from_its_permit() -> None:
     woken = Picking(held, [held], 50.0)
     assert woken.open is not None
     assert (woken.open.issued_s, woken.doubts["f1"].issued_s, woken.clear_s()) == (50.0, 50.0, 125.0)
+    same = Picking(held, [held], 1010.0, same_clock=True)
+    assert (same.open, same.doubts["f1"], same.clear_s()) == (held, held, 1075.0)
     assert (woken.undecided(124.9), woken.undecided(125.0)) == (["f1", "f1"], ["f1"])
     assert (Picking(None, [], 0.0).clear_s(), Picking(None, [], 0.0).undecided(0.0)) == (0.0, [])
 

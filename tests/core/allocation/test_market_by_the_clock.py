@@ -367,9 +367,11 @@ def test_silence_under_a_permit_is_waited_out_and_measured() -> None:
     assert plant.market.waiting(54.0) == "measuring again in 10 s, when the last dose has soaked in"
     plant.market.soil(0.15, "", 63.9)
     assert plant.market.permit_open
+    plant.market.soil(0.15, "", 64.0, stamp_s=63.9)
+    assert plant.market.permit_open, "taken before the dose can have soaked in"
     plant.market.soil(None, "stuck", 64.0)
     assert plant.market.waiting(64.0) == "cannot tell whether the last dose arrived: the soil probe is stuck"
-    plant.market.soil(0.15, "", 65.0)
+    plant.market.soil(0.15, "", 65.0, stamp_s=64.0)
     assert plant.task(T).reason == "soil went from 0.150 to 0.150: the dose did not arrive, asking again"
     assert (plant.task(T).delivered_ml, plant.task(T).permits, plant.market.document().failures) == (None, 1, {T: 0})
     assert plant.market.due_s() == 65.0
@@ -517,6 +519,27 @@ def test_a_restart_waits_for_an_open_dose_as_if_it_had_just_been_given(finished:
     assert again.market.permit_open
     again.market.soil(0.15, "", settled_s)
     assert not again.market.permit_open
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_change_that_could_not_be_saved_leaves_the_times_of_an_open_dose_as_they_are(finished: bool) -> None:
+    plant = awarded()
+    request = PermitRequest(robot_id="robot-1", epoch=1, act="water")
+    given = plant.market.permit(T, request, "k", 4.0)
+    if finished:
+        plant.now_s = 10.0
+        plant.report(T, "done")
+    document = plant.market.document()
+    same = Market(CARD, document, 12.0, Rules(), Limits(soak_s=10.0), same_clock=True)
+    assert same.permit(T, request, "k", 12.0) == given.model_copy(update={"valid_for_s": 7.0})
+    assert same.given_ml(86400.0) == given.dose_ml
+    assert same.given_ml(86400.0 + 54.0) == 0.0
+    late = Market(CARD, document, 100.0, Rules(), Limits(soak_s=10.0), same_clock=True)
+    assert late.permit(T, request, "k", 100.0).valid_for_s == 0.0
+    late.soil(0.15, "", 109.9)
+    assert late.permit_open, "its act may have ended just now"
+    late.soil(0.15, "", 110.0)
+    assert late.permit_open != finished
 
 
 def test_a_dose_of_a_cancelled_task_is_settled_all_the_same() -> None:

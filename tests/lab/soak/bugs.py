@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -208,11 +209,23 @@ def the_soil_is_not_awaited():
     """A dose is settled by the very next reading."""
     real = Watering.measured
 
-    def hasty(self, ratio, why, now_s):
-        self.settle_at_s = min(self.settle_at_s, now_s)
-        return real(self, ratio, why, now_s)
+    def hasty(self, soil, now_s):
+        self.settle_at_s = min(self.settle_at_s, soil.stamp_s)
+        return real(self, soil, now_s)
 
     with mock.patch.object(Watering, "measured", hasty):
+        yield
+
+
+@bug
+def an_old_reading_tells_of_a_new_dose():
+    """What the probe said before it fell silent counts as measured now."""
+    real = Watering.measured
+
+    def credulous(self, soil, now_s):
+        return real(self, replace(soil, stamp_s=now_s), now_s)
+
+    with mock.patch.object(Watering, "measured", credulous):
         yield
 
 
@@ -271,8 +284,8 @@ def a_restarted_plant_trusts_an_old_permit_time():
     """An open permit's time counts from the clock of before, which was another one."""
     real = Watering.__init__
 
-    def trusting(self, open_permit, *more):
-        real(self, open_permit, *more)
+    def trusting(self, open_permit, *more, **how):
+        real(self, open_permit, *more, **how)
         self.open = open_permit
 
     with mock.patch.object(Watering, "__init__", trusting):
