@@ -1,5 +1,5 @@
 # The verbs that people and CI use. `make up` on a fresh machine needs Python, git, make and a C compiler.
-.PHONY: install up test test-compose check bench reproduce soak mutants docs
+.PHONY: install debian up test test-compose check bench reproduce soak mutants docs
 .DEFAULT_GOAL := install
 
 PYTHON ?= python3
@@ -20,6 +20,11 @@ $(STAMP): pyproject.toml uv.lock
 	$(BIN)/uv sync --frozen --compile-bytecode --extra dev --extra conformance --extra bench --extra cluster --extra discovery --extra record
 	$(BIN)/python -m console.warm
 	@touch $@
+
+# What some tests and the example use of Debian, as root; the garden itself needs none of it.
+debian:
+	apt-get install --no-install-recommends -y babeld iproute2 strace
+	$(MAKE) -C examples/cgi-pot install
 
 up: $(STAMP)
 	@exec $(BIN)/garden up $(ARGS)

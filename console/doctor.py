@@ -28,7 +28,12 @@ from core.mesh.chassis import Readiness
 
 MARKS = {"ok": "[green]ok  [/green]", "note": "[yellow]note[/yellow]", "bad": "[red]BAD [/red]"}
 PACKAGES = ("numpy", "numba", "mujoco", "opencv-python-headless", "fastapi", "uvicorn", "pydantic", "pyserial")
-CGI_POT = ("lighttpd", "php", "php-cgi", "curl", "flock")
+TOOLS = {
+    "cgi-pot": (("lighttpd", "php", "php-cgi", "curl", "flock"), "examples/cgi-pot: `make -C examples/cgi-pot install`"),
+    "routing": (("babeld", "ip"), "finding peers by routes, and for its tests: `make debian`"),
+    "tracing": (("strace",), "tests of failing system calls: `make debian`"),
+}
+"""Programs that the garden itself does without: what they are for, and how Debian gives them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,15 +67,15 @@ def _machine() -> Iterator[Finding]:
         f"{docker}, DOCKER_HOST={os.environ.get('DOCKER_HOST') or 'default'}" if docker else "not found (only for compose)"
     )
     yield Finding("docker", "ok" if docker else "note", told)
-    yield _example()
+    yield from _tools()
 
 
-def _example() -> Finding:
-    """What `examples/cgi-pot` needs; the garden itself needs none of it."""
-    places = f"{os.environ.get('PATH', '')}:/usr/sbin"
-    missing = [tool for tool in CGI_POT if shutil.which(tool, path=places) is None]
-    told = f"missing: {', '.join(missing)} (only for examples/cgi-pot: `make -C examples/cgi-pot install`)"
-    return Finding("cgi-pot", "note" if missing else "ok", told if missing else f"{', '.join(CGI_POT)} are here")
+def _tools() -> Iterator[Finding]:
+    places = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
+    for what, (tools, use) in TOOLS.items():
+        missing = [tool for tool in tools if shutil.which(tool, path=places) is None]
+        told = f"missing: {', '.join(missing)} (only for {use})" if missing else f"found: {', '.join(tools)}"
+        yield Finding(what, "note" if missing else "ok", told)
 
 
 def _drawing() -> Finding:

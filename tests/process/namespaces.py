@@ -33,7 +33,7 @@ def unable(*tools: str) -> str:
         return "network namespaces take root"
     for tool in ("ip", *tools):
         if shutil.which(tool) is None:
-            return f"{tool} is not installed"
+            return f"{tool} is not installed: make debian"
     tried = subprocess.run(["ip", "netns", "add", "garden-try"], capture_output=True, text=True, check=False)
     subprocess.run(["ip", "netns", "del", "garden-try"], capture_output=True, check=False)
     return "" if tried.returncode == 0 else f"no namespaces here: {tried.stderr.strip()[:100]}"
