@@ -23,6 +23,7 @@ $(STAMP): pyproject.toml uv.lock
 
 # What some tests and the example use of Debian, as root; the garden itself needs none of it.
 debian:
+	apt-get update
 	apt-get install --no-install-recommends -y babeld iproute2 strace
 	$(MAKE) -C examples/cgi-pot install
 
