@@ -27,7 +27,7 @@ from sim.devices.bench_firmata import bench_emulator
 from sim.devices.host import EmulatorHost
 
 CONNECTIONS = 8
-REQUESTS = 800
+REQUESTS = 4000
 """A burst, over all connections."""
 GET_RATIO_MIN, POST_RATIO_MIN = 2.0, 1.5
 RSS_MB_MAX, READY_S_MAX = 90.0, 1.5
