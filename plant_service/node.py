@@ -114,12 +114,13 @@ def build_pot(parts: _Parts) -> Node:
     stored = parts.file("inventory", GATHER_S)
     fruits = Keeper(stored, InventoryDocument, lambda doc: Fruits(settings.id, doc), texts.stored)
 
-    read = 0
+    found: list[MarketDocument | None] = []
 
     def revived(doc: MarketDocument | None) -> Market:
-        nonlocal read
-        read += 1
-        market = Market(card, doc, clock.now(), limits=limits, same_clock=read > 1)
+        if not found:
+            found.append(doc)
+        # What this process saved itself is by this clock; what it found may not be, however often it is read.
+        market = Market(card, doc, clock.now(), limits=limits, same_clock=doc is not found[0])
         market.fruits(fruits.machine.inventory.fruits, clock.now())
         return market
 

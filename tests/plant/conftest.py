@@ -21,6 +21,7 @@ from core.mesh.auth import GardenKey
 from core.mesh.client import Answer
 from core.mesh.node import Node
 from core.mesh.peers import Peer, Peers
+from core.store import Disk
 from core.virtual import run_virtual
 from core.wire.geometry import Point3, Pose2
 from core.wire.market import Announcement, Award, Bid
@@ -246,6 +247,8 @@ class Garden:
         self.folder, self.rng = folder, random.Random(seed)
         self.clock = VirtualClock()
         self.net = MemoryNet(self.clock)
+        self.disk: Disk | None = None
+        """Of the pots that are started from now on; None for a good one."""
         self.soils: dict[str, Soil] = {}
         self.robots: dict[str, Robot] = {}
         self.nodes: dict[str, Node] = {}
@@ -321,7 +324,7 @@ class Garden:
         peers = Peers([Peer(id=name, kind="robot", url=f"http://{name}") for name in self.robots])
         node = build(
             settings, self.clock, self.net.open, self, self.rng, peers=peers, verifier=KEY.verifier(),
-            identity=KEY.issue(settings.id, "plant", 0.0),
+            identity=KEY.issue(settings.id, "plant", 0.0), disk=self.disk,
         )  # fmt: skip
         self.nodes[settings.id] = node
         loop = asyncio.get_running_loop()

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import sqlite3
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+from core.allocation.permits import OpenPermit
+from core.store import Disk
 
 Play = Any
 Garden = Any
@@ -132,5 +137,51 @@ def test_history_is_plain_sqlite(play: Play) -> None:
             kinds = {row[0] for row in db.execute("SELECT kind FROM entries")}
         db.close()
         assert {"probe", "soil"} <= kinds
+
+    play(story)
+
+
+class Full(Disk):
+    """While `full`, nothing can be written."""
+
+    full = False
+
+    def create(self, path: Path) -> int:
+        if self.full:
+            raise OSError(errno.ENOSPC, "no space left on device")
+        return super().create(path)
+
+
+def test_only_what_a_pot_saved_itself_is_by_its_own_clock_when_a_save_fails(play: Play) -> None:
+    async def story(garden: Garden) -> None:
+        disk = garden.disk = Full()
+        robot = garden.robot("robot-1")
+        robot.die_before_act = True
+        garden.pot(ratio=0.15)
+
+        def held() -> OpenPermit | None:
+            return garden.nodes["plant-1"].app.state.pot.place.market.document().open_permit
+
+        async def permitted() -> bool:
+            return held() is not None
+
+        async def fails() -> None:
+            disk.full = True
+            answer = await garden.call("plant-1", "POST", "/tasks", json={"kind": "inventory"})
+            assert answer.status_code == 507, answer.text
+            disk.full = False
+
+        await garden.until(permitted, 60.0)
+        given = held()
+        await garden.clock.sleep(3.0)
+        await fails()
+        assert held() == given
+        disk.full = True
+        await restart(garden, down_s=400.0)
+        began_s = garden.clock.now()
+        await fails()
+        again = held()
+        assert again is not None
+        assert again.issued_s >= began_s
 
     play(story)
