@@ -133,3 +133,11 @@ class Acts:
         before, self._last[permit.plant_id] = self._last.get(permit.plant_id), permit
         if before is not None and not self._measured(before.issued_s, permit):
             case.breach("I2", f"{permit.plant_id} gave {permit.permit_id} without a measurement after {before.permit_id}")
+
+    def settled(self, permit_id: str) -> None:
+        """I2: a plant has closed a permit to water; only a measurement may, taken when a dose must have soaked in."""
+        if (held := self._case.permits.get(permit_id)) is None:
+            return
+        soaked_s = held.until_s + self._limits.soak_s / SKEW - 1.0
+        if not any(at_s >= soaked_s for at_s in self._truth.pots[held.plant_id].samples_s):
+            self._case.breach("I2", f"{held.plant_id} closed permit {permit_id} without a measurement after it")

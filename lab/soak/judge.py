@@ -27,7 +27,7 @@ class Judge:
     def __init__(self, truth: Truth, gremlin: Gremlin) -> None:
         self._case = case = Case(truth, gremlin)
         self.acts, self.awards, self.progress = Acts(case), Awards(case), Progress(case)
-        self.papers = Papers(case, self.awards.read)
+        self.papers = Papers(case, self.awards.read, self.acts.settled)
         self._stops: set[str] = set()
         """E-stops that were confirmed: the same question gets the same answer again, also after a release."""
         self._stop_numbers: dict[str, int] = {}

@@ -29,9 +29,9 @@ class _Seen:
 class Papers:
     """Reads a plant's documents whenever they have changed."""
 
-    def __init__(self, case: Case, read: Callable[[str, Task], None]) -> None:
-        """`read` is called with every task of a document that is new."""
-        self._case, self._read = case, read
+    def __init__(self, case: Case, read: Callable[[str, Task], None], settled: Callable[[str], None]) -> None:
+        """`read` is called with every task of a new document, `settled` with every permit to water that it closes."""
+        self._case, self._read, self._settled = case, read, settled
         self._seen: dict[str, _Seen] = {}
         self._open: defaultdict[str, set[str]] = defaultdict(set)
         """Tasks by plant that were on disk and had not ended."""
@@ -80,9 +80,12 @@ class Papers:
         pot = self._case.garden.pot(plant_id)
         if pot is None or (document := pot.place._keeper.durable) is None:
             return []
-        if self._documents.get(plant_id) is not document:
+        before = self._documents.get(plant_id)
+        if before is not document:
             self._documents[plant_id] = document
             self._market(plant_id, pot, document)
+            if before is not None and (closed := _open_permit(before)) != _open_permit(document):
+                self._settled(closed)
         self._met_before[plant_id] = self._faults(plant_id)
         stored = pot.tending._fruits.durable
         if stored is not None and self._inventories.get(plant_id) is not stored.inventory:
@@ -162,3 +165,7 @@ class Papers:
         picked = [line.fruit_id for line in pot.tending.ledger.lines()[-40:] if line.outcome == "picked"]
         if len(picked) != len(set(picked)):
             self._case.breach("I3", f"{plant_id}'s ledger has a fruit picked twice")
+
+
+def _open_permit(document: MarketDocument) -> str:
+    return "" if document.open_permit is None else document.open_permit.permit.permit_id
