@@ -114,13 +114,17 @@ def build_pot(parts: _Parts) -> Node:
     stored = parts.file("inventory", GATHER_S)
     fruits = Keeper(stored, InventoryDocument, lambda doc: Fruits(settings.id, doc), texts.stored)
 
-    found: list[MarketDocument | None] = []
+    found: MarketDocument | None = None
+    woken: MarketDocument | None = None
 
     def revived(doc: MarketDocument | None) -> Market:
-        if not found:
-            found.append(doc)
-        # What this process saved itself is by this clock; what it found may not be, however often it is read.
-        market = Market(card, doc, clock.now(), limits=limits, same_clock=doc is not found[0])
+        nonlocal found, woken
+        if woken is None:
+            # What a process finds is by a clock that may be gone: it is put into this one's time once.
+            market = Market(card, doc, clock.now(), limits=limits)
+            found, woken = doc, market.document()
+        else:
+            market = Market(card, woken if doc is found else doc, clock.now(), limits=limits, same_clock=True)
         market.fruits(fruits.machine.inventory.fruits, clock.now())
         return market
 

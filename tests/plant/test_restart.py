@@ -152,7 +152,7 @@ class Full(Disk):
         return super().create(path)
 
 
-def test_only_what_a_pot_saved_itself_is_by_its_own_clock_when_a_save_fails(play: Play) -> None:
+def test_an_open_permit_is_put_into_a_new_clocks_time_once_whatever_fails_to_be_saved(play: Play) -> None:
     async def story(garden: Garden) -> None:
         disk = garden.disk = Full()
         robot = garden.robot("robot-1")
@@ -183,5 +183,8 @@ def test_only_what_a_pot_saved_itself_is_by_its_own_clock_when_a_save_fails(play
         again = held()
         assert again is not None
         assert again.issued_s >= began_s
+        await garden.clock.sleep(3.0)
+        await fails()
+        assert held() == again, "put into this clock's time once"
 
     play(story)
