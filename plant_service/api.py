@@ -198,8 +198,12 @@ def _robot_routes(app: FastAPI, pot: Pot) -> None:
         caller: Caller = allow("robot"),
         request: PermitRequest = body(PermitRequest),
         idempotency_key: IdempotencyKey = "",
+        *,
+        response: Response,
     ) -> Permit:
         speaks_for(caller, request.robot_id)
+        # What is left of a permit's time is another thing each time it is asked for.
+        response.headers["cache-control"] = "no-store"
         return await pot.tending.permit(task_id, request, idempotency_key)
 
 

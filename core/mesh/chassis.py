@@ -99,7 +99,8 @@ def create_app(
 
     `ready` lists what is still missing (empty: ready). `verifier` None switches authentication off, for tests.
     With `open_reads` false every request but health needs a token. Every POST with an `Idempotency-Key` is answered once
-    and the same again. A browser that asks for `/` gets `page`, if there is one.
+    and the same again; an answer with `Cache-Control: no-store` is asked of the route anew. A browser that asks for `/`
+    gets `page`, if there is one.
     `app.state` holds clock, verifier, events and registry.
     """
     app = FastAPI(

@@ -73,6 +73,7 @@ class _Kept:
     request: bytes
     at_s: float
     messages: tuple[Message, ...]
+    """Empty when the answer held only then (`Cache-Control: no-store`): the route knows the key and answers anew."""
 
 
 def request_counter(registry: CollectorRegistry) -> Counter:
@@ -211,7 +212,7 @@ class Guard:
         return TooLarge("the body is too long", hint=f"at most {self._body_bytes_max} bytes")
 
     async def _once(self, key: str, scope: Scope, receive: Receive, send: Send) -> None:
-        """Run a keyed POST once; the same key gets the same answer again.
+        """Run a keyed POST once; the same key gets the same answer again, unless that says `no-store`.
 
         Only good answers are kept: whatever was refused changed nothing and may be tried anew.
         """
@@ -225,9 +226,10 @@ class Guard:
         if (kept := self._recall(full_key)) is not None:
             if kept.request != request:
                 raise Unprocessable("this Idempotency-Key came before with another body", hint="take a new key")
-            for message in kept.messages:
-                await send(message)
-            return
+            if kept.messages:
+                for message in kept.messages:
+                    await send(message)
+                return
         self._running.add(full_key)
         try:
             await self._run_kept(full_key, request, content, scope, receive, send)
@@ -253,7 +255,8 @@ class Guard:
 
         await self._run(scope, feed, keep)
         if messages and 200 <= messages[0].get("status", 0) < 300:
-            self._kept[full_key] = _Kept(request, self._clock.now(), tuple(messages))
+            lasts = header(messages[0]["headers"], b"cache-control") != "no-store"
+            self._kept[full_key] = _Kept(request, self._clock.now(), tuple(messages) if lasts else ())
             if len(self._kept) > KEPT_ANSWERS:
                 self._kept.popitem(last=False)
 

@@ -141,6 +141,41 @@ def test_history_is_plain_sqlite(play: Play) -> None:
     play(story)
 
 
+def test_a_permit_asked_for_again_has_what_is_left_of_its_time(play: Play) -> None:
+    async def story(garden: Garden) -> None:
+        robot = garden.robot("robot-1")
+        robot.die_before_act = True
+        garden.pot(ratio=0.15)
+        held = garden.nodes["plant-1"].app.state.pot.place.market
+
+        async def permitted() -> bool:
+            return bool(held.permit_open)
+
+        await garden.until(permitted, 60.0)
+        given = held.document().open_permit
+        assert given is not None
+        wish = {"robot_id": "robot-1", "epoch": given.permit.epoch, "act": "water", "amount_ml": given.permit.dose_ml}
+        path, lefts = f"/tasks/{given.permit.task_id}/permits", []
+        for _ in range(4):
+            await garden.clock.sleep(6.0)
+            answer = await garden.call(
+                "plant-1", "POST", path, json=wish, who="robot-1", role="robot", headers={"idempotency-key": given.key}
+            )
+            assert answer.status_code == 200, answer.text
+            assert answer.json()["permit_id"] == given.permit.permit_id
+            lefts.append(answer.json()["valid_for_s"])
+        assert lefts[0] < 9.1
+        assert lefts[0] - lefts[1] == pytest.approx(6.0, abs=0.1)
+        assert lefts[2:] == [0.0, 0.0]
+        wish |= {"amount_ml": 1.0}
+        answer = await garden.call(
+            "plant-1", "POST", path, json=wish, who="robot-1", role="robot", headers={"idempotency-key": given.key}
+        )
+        assert answer.status_code == 422, "another question under the same key"
+
+    play(story)
+
+
 class Full(Disk):
     """While `full`, nothing can be written."""
 
