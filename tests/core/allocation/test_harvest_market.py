@@ -357,6 +357,7 @@ class Play:
         self.market = market(" ".join(sorted(self.listed)))
         self.told: dict[tuple[str, int], list[Pick]] = {}
         self.acting: list[tuple[float, str, int, Permit]] = []
+        self.used: set[str] = set()
 
     def run(self) -> None:
         for _ in range(400):
@@ -397,7 +398,10 @@ class Play:
             except Refused:
                 pass
             else:
-                if self.rng.random() < 0.8 and all(a[3].permit_id != given.permit_id for a in self.acting):
+                # A robot takes a permit for one shot, and none whose time is over.
+                fresh = given.valid_for_s > 0.0 and given.permit_id not in self.used
+                if self.rng.random() < 0.8 and fresh:
+                    self.used.add(given.permit_id)
                     begin_s = self.now_s + self.rng.uniform(0.0, given.valid_for_s)
                     self.acting.append((begin_s + self.rng.uniform(1.0, PICK_S_MAX), robot_id, epoch, given))
         state = self.rng.choice(("running", "running", "running", "done", "failed"))
