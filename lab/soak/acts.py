@@ -115,7 +115,7 @@ class Acts:
         case, said, now_s = self._case, json.loads(answer.body), self._truth.now()
         life, until_s = case.garden.running[message.target].life, now_s + said["valid_for_s"] * SKEW
         if (known := case.permits.get(said["permit_id"])) is not None:
-            if known.life is not life:
+            if known.life is not life and said["valid_for_s"] > 0.0:
                 # A plant that was started anew does not know how long ago it gave it: its whole time counts anew.
                 case.permits[known.permit_id] = replace(known, until_s=until_s, life=life)
             return
