@@ -155,22 +155,22 @@ def test_a_permit_asked_for_again_has_what_is_left_of_its_time(play: Play) -> No
         given = held.document().open_permit
         assert given is not None
         wish = {"robot_id": "robot-1", "epoch": given.permit.epoch, "act": "water", "amount_ml": given.permit.dose_ml}
-        path, lefts = f"/tasks/{given.permit.task_id}/permits", []
+        path, key = f"/tasks/{given.permit.task_id}/permits", {"idempotency-key": given.key}
+
+        async def asked(wish: dict[str, Any]) -> Any:
+            return await garden.call("plant-1", "POST", path, json=wish, who="robot-1", role="robot", headers=key)
+
+        lefts = []
         for _ in range(4):
             await garden.clock.sleep(6.0)
-            answer = await garden.call(
-                "plant-1", "POST", path, json=wish, who="robot-1", role="robot", headers={"idempotency-key": given.key}
-            )
+            answer = await asked(wish)
             assert answer.status_code == 200, answer.text
             assert answer.json()["permit_id"] == given.permit.permit_id
             lefts.append(answer.json()["valid_for_s"])
         assert lefts[0] < 9.1
         assert lefts[0] - lefts[1] == pytest.approx(6.0, abs=0.1)
         assert lefts[2:] == [0.0, 0.0]
-        wish |= {"amount_ml": 1.0}
-        answer = await garden.call(
-            "plant-1", "POST", path, json=wish, who="robot-1", role="robot", headers={"idempotency-key": given.key}
-        )
+        answer = await asked(wish | {"amount_ml": 1.0})
         assert answer.status_code == 422, "another question under the same key"
 
     play(story)
