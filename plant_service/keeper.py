@@ -36,11 +36,15 @@ class Keeper(Generic[M, D]):
         model: type[D],
         revive: Callable[[D | None], M],
         encode: Callable[[D], bytes] = _dump,
+        found: Callable[[D], D] = lambda document: document,
     ) -> None:
-        """Reads the file; `revive` makes the machine of a document, `encode` its JSON, off the loop. Raises StorageError."""
+        """Reads the file; `revive` makes the machine of a document, `encode` its JSON, off the loop. Raises StorageError.
+
+        `found` says what another process's document means in this one; called once, here.
+        """
         self._file, self._revive, self._encode = file, revive, encode
         stored = file.load()
-        self.durable: D | None = None if stored is None else model.model_validate(stored)
+        self.durable: D | None = None if stored is None else found(model.model_validate(stored))
         self._machine = revive(self.durable)
         self._failures = self._saving = 0
         self.commits, self.commit_s, self.last_commit_s = 0, 0.0, 0.0

@@ -114,21 +114,12 @@ def build_pot(parts: _Parts) -> Node:
     stored = parts.file("inventory", GATHER_S)
     fruits = Keeper(stored, InventoryDocument, lambda doc: Fruits(settings.id, doc), texts.stored)
 
-    found: MarketDocument | None = None
-    woken: MarketDocument | None = None
-
     def revived(doc: MarketDocument | None) -> Market:
-        nonlocal found, woken
-        if woken is None:
-            # What a process finds is by a clock that may be gone: it is put into this one's time once.
-            market = Market(card, doc, clock.now(), limits=limits)
-            found, woken = doc, market.document()
-        else:
-            market = Market(card, woken if doc is found else doc, clock.now(), limits=limits, same_clock=True)
+        market = Market(card, doc, clock.now(), limits=limits)
         market.fruits(fruits.machine.inventory.fruits, clock.now())
         return market
 
-    market = Keeper(parts.file("market"), MarketDocument, revived)
+    market = Keeper(parts.file("market"), MarketDocument, revived, found=lambda doc: doc.by_clock(clock.now()))
     lines = Keeper(parts.file("ledger"), LedgerDocument, Lines)
     care = Keeper(parts.file("settings"), SettingsPatch, lambda doc: Care(base, doc))
     docks = parts.docks([settings.id])

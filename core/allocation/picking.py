@@ -48,13 +48,9 @@ class OpenPick(Document):
 class Picking:
     """The fruit as the plant knows them, the open pick, and the fruit in doubt."""
 
-    def __init__(
-        self, open_pick: OpenPick | None, doubts: Sequence[OpenPick], now_s: float, *, same_clock: bool = False
-    ) -> None:
-        # Where the clock of before may not be this one, every act waits its whole time anew.
-        anew = {} if same_clock else {"issued_s": now_s}
-        self.open = None if open_pick is None else open_pick.model_copy(update=anew)
-        self.doubts = {doubt.permit.fruit_id: doubt.model_copy(update=anew) for doubt in doubts}
+    def __init__(self, open_pick: OpenPick | None, doubts: Sequence[OpenPick]) -> None:
+        self.open = open_pick
+        self.doubts = {doubt.permit.fruit_id: doubt for doubt in doubts}
         self.fruits: dict[str, Fruit] = {}
 
     def know(self, fruits: Iterable[Fruit]) -> None:

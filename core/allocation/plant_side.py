@@ -3,8 +3,8 @@
 Whoever runs it calls an event (`ask`, `bid`, `report`, `permit`, `soil`, `fruits`, `cancel`, `tick` ...) with the garden
 time, makes `document()` durable when `dirty`, and only then carries out `take_effects()` and answers. Nothing here waits.
 A task lives through announced, awarded, running and ends done, failed or cancelled. Moving to another robot adds to its
-epoch. After a restart `Market(..., document)` goes on: holders get a fresh lease, an open permit its whole waiting time.
-Tasks, rounds and leases are in `tasks`; what a dose needs in `watering`, what a pick needs in `picking`.
+epoch. After a restart `Market(..., document.by_clock(now_s))` goes on: holders get a fresh lease, an open permit its whole
+waiting time. Tasks, rounds and leases are in `tasks`; what a dose needs in `watering`, what a pick needs in `picking`.
 """
 
 from __future__ import annotations
@@ -32,17 +32,13 @@ class Market(TaskBook):
         now_s: float,
         rules: Rules | None = None,
         limits: Limits | None = None,
-        *,
-        same_clock: bool = False,
     ) -> None:
-        """Goes on from `document`; `same_clock`: it is of this process, whose last change could not be saved."""
+        """Goes on from `document`, whose times are of this clock (`MarketDocument.by_clock`)."""
         before = document or MarketDocument()
         super().__init__(card, before, now_s, rules)
         self.limits = limits or Limits()
-        self._water = Watering(
-            before.open_permit, before.doses, now_s, self.limits, before.doses_at_s, same_clock=same_clock
-        )
-        self._picks = Picking(before.open_pick, before.doubts, now_s, same_clock=same_clock)
+        self._water = Watering(before.open_permit, before.doses, now_s, self.limits)
+        self._picks = Picking(before.open_pick, before.doubts)
         self._scanned = dict(before.scanned)
         if (held := self._water.open) is not None:
             task = self._tasks.get(held.permit.task_id)

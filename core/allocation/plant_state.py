@@ -14,6 +14,7 @@ from core.allocation.picking import OpenPick
 from core.wire.documents import Document
 from core.wire.market import (
     BID_WINDOW_S,
+    FINAL_STATES,
     LEASE_S,
     REALLOCATE_MARGIN_RATIO,
     REALLOCATE_S,
@@ -103,6 +104,29 @@ class MarketDocument(Document):
     scanned: dict[str, str] = {}
     """Inventory tasks whose scan has come, and its id."""
     keyed: list[Keyed] = []
+
+    def by_clock(self, now_s: float) -> MarketDocument:
+        """What another process left, in the time of this one's clock, which may have begun anew.
+
+        An act nobody told the end of has its whole time again from `now_s`; the day's doses are as old as they were.
+        """
+        return self.model_copy(
+            update={
+                "tasks": [task if task.state in FINAL_STATES else _in_new_time(task, now_s) for task in self.tasks],
+                "open_permit": self.open_permit and self.open_permit.model_copy(update={"issued_s": now_s}),
+                "doses": permits.revived(self.doses, self.doses_at_s, now_s),
+                "doses_at_s": now_s,
+                "open_pick": self.open_pick and self.open_pick.model_copy(update={"issued_s": now_s}),
+                "doubts": [doubt.model_copy(update={"issued_s": now_s}) for doubt in self.doubts],
+            }
+        )
+
+
+def _in_new_time(task: Task, now_s: float) -> Task:
+    """A task of before the restart. When the clock began anew, its deadline is as far away as when it was asked for."""
+    if task.deadline_s is None or task.created_s <= now_s:
+        return task
+    return task.model_copy(update={"created_s": now_s, "deadline_s": now_s + task.deadline_s - task.created_s})
 
 
 @dataclass(frozen=True, slots=True)

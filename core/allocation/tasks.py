@@ -30,8 +30,6 @@ class TaskBook:
         self._tasks = {task.task_id: task for task in before.tasks}
         self._failures = dict(before.failures)
         self._keyed = {each.name: each for each in before.keyed}
-        for task in self.open_tasks():
-            self._tasks[task.task_id] = _in_new_time(task, now_s)
         self._live = {task.task_id: Live.revived(task, now_s, self.rules) for task in self.open_tasks()}
         self._rounds = 0
         self._gave_up_s: dict[str, float] = {}
@@ -363,10 +361,3 @@ def _begin_by_s(task: Task) -> float:
     """Its deadline while nobody has begun it, else infinite: what has begun is finished."""
     waits = task.state in ("announced", "awarded")
     return task.deadline_s if waits and task.deadline_s is not None else math.inf
-
-
-def _in_new_time(task: Task, now_s: float) -> Task:
-    """A task of before the restart. When the clock began anew, its deadline is as far away as when it was asked for."""
-    if task.deadline_s is None or task.created_s <= now_s:
-        return task
-    return task.model_copy(update={"created_s": now_s, "deadline_s": now_s + task.deadline_s - task.created_s})

@@ -61,24 +61,10 @@ class _Watch:
 class Watering:
     """The soil as last measured, the day's doses, and the permit that is not settled yet; `at_s` is when that was."""
 
-    def __init__(
-        self,
-        open_permit: OpenPermit | None,
-        doses: Sequence[Dose],
-        now_s: float,
-        limits: Limits,
-        doses_at_s: float | None = None,
-        *,
-        same_clock: bool = False,
-    ) -> None:
-        """`doses_at_s` is the time of the clock of before at which the doses were written down."""
+    def __init__(self, open_permit: OpenPermit | None, doses: Sequence[Dose], now_s: float, limits: Limits) -> None:
         self.limits = limits
         self.soil = Soil(None, "not measured yet", -math.inf)
-        self.doses, self.at_s = permits.revived(doses, now_s if same_clock else doses_at_s, now_s), now_s
-        self.open = open_permit
-        if open_permit is not None and not same_clock:
-            # The clock of before may not be this one: an open permit waits its whole time anew.
-            self.open = open_permit.model_copy(update={"issued_s": now_s})
+        self.open, self.doses, self.at_s = open_permit, list(doses), now_s
         self.settle_at_s = math.inf
         self._watch = _Watch(math.inf if self.open is not None else now_s + limits.soak_s)
 

@@ -121,7 +121,7 @@ def test_a_restart_keeps_the_deadline_and_a_clock_that_began_anew_moves_it(
     began_s: float, restarted_s: float, deadline_s: float
 ) -> None:
     play = Play(now_s=began_s)
-    again = Play(document=play.market.document(), now_s=restarted_s)
+    again = Play(document=play.market.document().by_clock(restarted_s), now_s=restarted_s)
     assert (again.task.created_s, again.task.deadline_s) == (min(began_s, restarted_s), deadline_s)
     again.costs = {"robot-1": None}
     again.run(restarted_s, deadline_s - 0.1)

@@ -33,7 +33,7 @@ def fruit(name: str, **more: Any) -> Fruit:
 
 
 def market(names: str = "f1 f2 f3", document: MarketDocument | None = None, now_s: float = 0.0) -> Market:
-    made = Market(CARD, document, now_s)
+    made = Market(CARD, document and document.by_clock(now_s), now_s)
     made.fruits([fruit(name) for name in names.split()], now_s)
     return made
 
@@ -152,26 +152,26 @@ def test_the_times_of_a_pick_are_reckoned_from_its_permit() -> None:
                     robot_id="robot-1", issued_s=1000.0)  # fmt: skip
     assert (held.act_over_s(), held.key) == (1075.0, "")
     assert [held.again(now_s).valid_for_s for now_s in (990.0, 1000.0, 1004.0, 1020.0)] == [15.0, 15.0, 11.0, 0.0]
-    woken = Picking(held, [held], 50.0)
-    assert woken.open is not None
-    assert (woken.open.issued_s, woken.doubts["f1"].issued_s, woken.clear_s()) == (50.0, 50.0, 125.0)
-    same = Picking(held, [held], 1010.0, same_clock=True)
-    assert (same.open, same.doubts["f1"], same.clear_s()) == (held, held, 1075.0)
-    assert (woken.undecided(124.9), woken.undecided(125.0)) == (["f1", "f1"], ["f1"])
-    assert (Picking(None, [], 0.0).clear_s(), Picking(None, [], 0.0).undecided(0.0)) == (0.0, [])
+    picks = Picking(held, [held])
+    assert (picks.open, picks.doubts["f1"], picks.clear_s()) == (held, held, 1075.0)
+    assert (picks.undecided(1074.9), picks.undecided(1075.0)) == (["f1", "f1"], ["f1"])
+    assert (Picking(None, []).clear_s(), Picking(None, []).undecided(0.0)) == (0.0, [])
+    woken = MarketDocument(open_pick=held, doubts=[held]).by_clock(50.0)
+    assert woken.open_pick is not None
+    assert (woken.open_pick.act_over_s(), woken.doubts[0].act_over_s()) == (125.0, 125.0)
 
 
 def test_a_permit_is_held_by_its_robot_alone_and_known_by_its_name() -> None:
     held = OpenPick(permit=Permit(permit_id="p", task_id="t", epoch=1, act="pick", fruit_id="f1", valid_for_s=15.0),
                     robot_id="robot-1", issued_s=0.0)  # fmt: skip
     other = held.model_copy(update={"permit": held.permit.model_copy(update={"permit_id": "q", "fruit_id": "f2"})})
-    picks = Picking(held, [other], 0.0)
+    picks = Picking(held, [other])
     assert [picks.holds(*who) for who in (("t", "robot-1", 1), ("t", "robot-1", 2), ("t", "robot-2", 1))] == [
         True,
         False,
         False,
     ]
-    assert not Picking(None, [other], 0.0).holds("t", "robot-1", 1)
+    assert not Picking(None, [other]).holds("t", "robot-1", 1)
     assert (picks.held("p", "robot-1"), picks.held("q", "robot-1")) == (picks.open, picks.doubts["f2"])
     assert (picks.held("p", "robot-2"), picks.held("", "robot-1"), picks.held("r", "robot-1")) == (None, None, None)
     assert [settles(picks.open, pick(name, how), picks.open) for name, how in (("f1", "failed"), ("f2", "picked"))] == [

@@ -80,7 +80,7 @@ class Plant:
 
     def restarted(self, now_s: float) -> Plant:
         document = MarketDocument.model_validate_json(self.market.document().model_dump_json())
-        return Plant(document, now_s, **self.costs_s)
+        return Plant(document.by_clock(now_s), now_s, **self.costs_s)
 
     def task(self, task_id: str) -> Task:
         return self.market.task(task_id)
@@ -156,7 +156,7 @@ def test_the_day_s_doses_are_written_down_with_the_time_of_the_clock_they_are_to
     assert (document.doses_at_s, [(dose.t_s, dose.ml) for dose in document.doses]) == (4.0, [(4.0 + 15.0 + 35.0, 150.0)])
     plant.market.soil(0.15, "", 7.0)
     assert plant.market.document().doses_at_s == 7.0
-    again = Plant(plant.market.document(), 1000.0)
+    again = plant.restarted(1000.0)
     assert [(dose.t_s, dose.ml) for dose in again.market.document().doses] == [(1047.0, 150.0)]
     assert again.market.document().doses_at_s == 1000.0
     assert (again.market.left_ml(1000.0), again.market.left_ml(1047.0 + 86400.0)) == (1350.0, 1500.0)
@@ -530,11 +530,11 @@ def test_a_change_that_could_not_be_saved_leaves_the_times_of_an_open_dose_as_th
         plant.now_s = 10.0
         plant.report(T, "done")
     document = plant.market.document()
-    same = Market(CARD, document, 12.0, Rules(), Limits(soak_s=10.0), same_clock=True)
+    same = Market(CARD, document, 12.0, Rules(), Limits(soak_s=10.0))
     assert same.permit(T, request, "k", 12.0) == given.model_copy(update={"valid_for_s": 7.0})
     assert same.given_ml(86400.0) == given.dose_ml
     assert same.given_ml(86400.0 + 54.0) == 0.0
-    late = Market(CARD, document, 100.0, Rules(), Limits(soak_s=10.0), same_clock=True)
+    late = Market(CARD, document, 100.0, Rules(), Limits(soak_s=10.0))
     assert late.permit(T, request, "k", 100.0).valid_for_s == 0.0
     late.soil(0.15, "", 109.9)
     assert late.permit_open, "its act may have ended just now"

@@ -33,7 +33,7 @@ def bid(robot_id: str, cost_s: float | None, task_id: str = "t") -> Bid:
 
 
 def market(document: MarketDocument | None = None, now_s: float = 0.0) -> Market:
-    made = Market(CARD, document, now_s, limits=Limits(soak_s=10.0))
+    made = Market(CARD, document and document.by_clock(now_s), now_s, limits=Limits(soak_s=10.0))
     made.soil(0.15, "", now_s)
     return made
 
@@ -92,7 +92,7 @@ def test_a_dose_and_what_of_it_soaks_in_later_is_not_taken_for_a_leak() -> None:
 def test_after_a_restart_only_what_rises_from_then_on_is_told() -> None:
     made = market()
     made.soil(0.150, "", 20.0)
-    again = Market(CARD, made.document(), 30.0, limits=Limits(soak_s=10.0))
+    again = Market(CARD, made.document().by_clock(30.0), 30.0, limits=Limits(soak_s=10.0))
     for t_s, ratio in ((31.0, 0.150), (39.0, 0.200), (41.0, 0.200), (42.0, 0.229)):
         again.soil(ratio, "", t_s)
     assert not unasked(again)

@@ -15,6 +15,7 @@ from core import store
 from core.allocation import tasks
 from core.allocation.epochs import Names
 from core.allocation.plant_side import Market
+from core.allocation.plant_state import MarketDocument
 from core.allocation.queue import Entry, TaskQueue
 from core.allocation.tasks import TaskBook
 from core.allocation.watering import Watering
@@ -282,13 +283,12 @@ def a_picked_fruit_stays_in_the_inventory():
 @bug
 def a_restarted_plant_trusts_an_old_permit_time():
     """An open permit's time counts from the clock of before, which was another one."""
-    real = Watering.__init__
+    real = MarketDocument.by_clock
 
-    def trusting(self, open_permit, *more, **how):
-        real(self, open_permit, *more, **how)
-        self.open = open_permit
+    def trusting(self, now_s):
+        return real(self, now_s).model_copy(update={"open_permit": self.open_permit})
 
-    with mock.patch.object(Watering, "__init__", trusting):
+    with mock.patch.object(MarketDocument, "by_clock", trusting):
         yield
 
 
