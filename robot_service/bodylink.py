@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
+import msgspec
 import structlog
 
 from core.clock import Clock
@@ -28,7 +29,11 @@ class BodyLink:
         self._seq = 0
         self._patient_until_s = -1e9
         self._resting: bool | None = None
+        self._bodys: BodyState | None = None
+        """Its last word on this connection, as it said it."""
+        self._ahead_s = 0.0
         self.state: BodyState | None = None
+        """Its last word, in the brain's time and with one count of its wheels' beginnings, over its restarts."""
         self.why = "not connected yet"
         self.listeners: list[Callable[[BodyState], None]] = []
         self.sent = 0
@@ -62,7 +67,7 @@ class BodyLink:
 
     def _greet(self, link: ByteLink) -> None:
         link.write(encode(Hello(secret=self._secret)))
-        self._link, self._resting = link, None
+        self._link, self._resting, self._bodys = link, None, None
         _log.info("body link up", url=self._url)
 
     def _say_down(self, why: str) -> None:
@@ -79,11 +84,18 @@ class BodyLink:
                     raise Unprocessable("the body sent something else than its state")
                 self._take(message)
 
-    def _take(self, state: BodyState) -> None:
-        self.state = state
-        self._patient_until_s = self._clock.now() + state.next_in_s + SILENCE_S
+    def _take(self, said: BodyState) -> None:
+        now_s, before = self._clock.now(), self.state
+        if self._bodys is None:
+            # It may be another process than before: its clock and its wheels' counters may have begun anew.
+            self._ahead_s = said.stamp_s - (now_s if before is None else max(now_s, before.stamp_s))
+        epoch = 0 if before is None else before.odometry_epoch
+        epoch += self._bodys is None or said.odometry_epoch != self._bodys.odometry_epoch
+        self._bodys = said
+        self.state = msgspec.structs.replace(said, stamp_s=said.stamp_s - self._ahead_s, odometry_epoch=epoch)
+        self._patient_until_s = now_s + said.next_in_s + SILENCE_S
         for listener in self.listeners:
-            listener(state)
+            listener(self.state)
 
     def want(
         self,

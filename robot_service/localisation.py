@@ -92,7 +92,7 @@ class Localisation:
             self.docked_at = ""
             return
         if not self.docked_at and (name := self.dock_here()):
-            self.docked_at, self.docked_s = name, state.stamp_s
+            self.docked_at, self.docked_s = name, self._clock.now()
             if self._filter.lost or self.sigma_m > DOCK_SIGMA_M:
                 self._filter.correct(*self._docks[name], state.stamp_s)
 

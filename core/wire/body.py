@@ -72,13 +72,13 @@ class Marker(_Line, frozen=True, kw_only=True, tag=False, tag_field=None):
 
 
 class BodyState(_Line, frozen=True, kw_only=True, tag="state"):
-    """One sample of everything the body knows. Times are the body's garden clock."""
+    """One sample of everything the body knows. Times are the body's garden clock; `BodyLink` puts them into the brain's."""
 
     stamp_s: float
     left_m: float = 0.0
     right_m: float = 0.0
     odometry_epoch: int = 0
-    """Grows when the base reconnected and the travel counters began anew."""
+    """Grows when the base reconnected and the travel counters began anew; in a body that was started anew it begins anew."""
     bump_left: bool = False
     bump_right: bool = False
     wheel_drop: bool = False

@@ -104,6 +104,8 @@ class StandInBody:
         self.arm: Joints | None = None
         self.permits: dict[str, float] = {}
         self.link: ByteLink | None = None
+        self.ahead_s = 0.0
+        """Of the brain's clock."""
         self.setpoint: Setpoint | None = None
         self.heard_s = -1e9
         self.left_m = self.right_m = 0.0
@@ -120,6 +122,13 @@ class StandInBody:
         self._dock_of: tuple[Pose | None, str] = (None, "")
         plane.bodies.append(self)
         net.listen(name, self._accept)
+
+    async def begin_anew(self, ahead_s: float) -> None:
+        """Its process dies and another one begins: by another clock, its wheels' counters at nothing."""
+        if self.link is not None:
+            await self.link.close()
+        self.link = self.setpoint = None
+        self.ahead_s, self.left_m, self.right_m = ahead_s, 0.0, 0.0
 
     def _accept(self, link: ByteLink) -> None:
         if self.link is not None:
@@ -293,7 +302,7 @@ class StandInBody:
         now_s = self.clock.now()
         marker = self.marker and structs.replace(self.marker, age_s=now_s - self._marker_s)
         state = BodyState(
-            stamp_s=now_s,
+            stamp_s=now_s + self.ahead_s,
             left_m=self.left_m,
             right_m=self.right_m,
             bump_left=self.bump[0],

@@ -43,6 +43,39 @@ def test_either_way_of_docking_ends_with_charge_current_at_the_far_pot(how):
     in_garden(story, seed=2, docking=how)
 
 
+@pytest.mark.parametrize("ahead_s", [-5000.0, 5000.0])
+def test_a_body_that_is_started_anew_leaves_the_robot_where_it_is(ahead_s):
+    async def story(garden):
+        await garden.award("plant-3")
+        robot, where = garden.bodies["robot-1"], garden.brains["robot-1"].robot.where
+        await garden.until(lambda: robot.left_m > 1.0, 60.0)
+        stamp_s = garden.brains["robot-1"].body.state.stamp_s
+        await robot.begin_anew(ahead_s)
+        await garden.until(lambda: robot.link is not None, 5.0)
+        for _ in range(40):
+            await garden.clock.sleep(0.05)
+            assert distance_m(where.pose, robot.pose) < 0.1
+            assert where.lost == ""
+            assert 0.0 <= garden.brains["robot-1"].body.state.stamp_s - stamp_s < 5.0
+        await garden.until(lambda: garden.plants["plant-3"].ended, 150.0)
+        assert garden.plants["plant-3"].ended.state == "done"
+
+    in_garden(story)
+
+
+@pytest.mark.parametrize("ahead_s", [-5000.0, 5000.0])
+def test_what_is_under_way_is_priced_by_the_brains_clock_whatever_its_bodys_says(ahead_s):
+    async def story(garden):
+        robot = garden.bodies["robot-1"]
+        await robot.begin_anew(ahead_s)
+        await garden.award("plant-1")
+        await garden.until(lambda: poured(garden, "plant-1") > 75.0, 120.0)
+        bid = await garden.bid("plant-2")
+        assert 5.0 <= bid.breakdown.current_s < 25.0
+
+    in_garden(story)
+
+
 def test_the_papers_filter_drives_it_too():
     async def story(garden):
         await garden.award("plant-4")
