@@ -124,7 +124,7 @@ class Gremlin:
         kinds: list[Callable[[], Coroutine[Any, Any, None]]] = [
             self._storm, self._storm, self._storm, self._cut, self._partition, self._crash, self._crash, self._crash,
             self._pause, self._pause, self._arm_disk, self._arm_disk, self._battery, self._pump, self._tap, self._probe,
-            self._power_cycle,
+            self._power_cycle, self._body_crash,
         ]  # fmt: skip
         self._later(self.rng.choice(kinds)())
 
@@ -211,13 +211,21 @@ class Gremlin:
     async def _power_cycle(self, robot_id: str = "", kind: str = "crash_robot") -> None:
         """The whole robot goes dark: brain and body."""
         robot_id = robot_id or self.rng.choice(self.garden.names("robot"))
-        body = f"{robot_id}-body"
+        await self._goes_dark(kind, robot_id, f"{robot_id}-body", robot_id)
+
+    async def _body_crash(self) -> None:
+        """A robot's body dies, and its brain lives on."""
+        robot_id = self.rng.choice(self.garden.names("robot"))
+        await self._goes_dark("crash_body", robot_id, f"{robot_id}-body")
+
+    async def _goes_dark(self, kind: str, robot_id: str, *names: str) -> None:
+        """These of its processes die, and are started some time later in this order."""
         self.strike(kind, robot_id)
-        for name in (robot_id, body):
+        for name in names:
             self.garden.kill(name)
         await asyncio.sleep(self.rng.choice(DOWN_S))
         self.touch(robot_id)
-        for name in (body, robot_id):
+        for name in names:
             if self.garden.running.get(name) is None:
                 self.garden.start(name)
 
