@@ -15,9 +15,11 @@ QUICK = ("acknowledged_before_fsync", "a_repeated_award_is_keyed_and_differs")
 def seeds_until_found(name, seeds_max=SEEDS_MAX):
     """How many gardens are needed, and the invariant that broke; None when none of them found it."""
     for seed in range(1, seeds_max + 1):
+        plan = Plan(seed=seed, days=0.05, hurry=3.0, one_breach=True)
         with bugs.BUGS[name]():
-            outcome = soak(Plan(seed=seed, days=0.05, hurry=3.0, one_breach=True))
+            outcome = soak(plan)
         if outcome.breaches:
+            assert not soak(plan).breaches, f"seed {seed} breaks without the mistake, too"
             return seed, outcome.breaches[0]
     return None
 
